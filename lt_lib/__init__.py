@@ -1,0 +1,1 @@
+"""The library under the notebooks: scene and camera, encoder and messages, learners, statistics and figures."""

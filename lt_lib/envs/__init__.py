@@ -1,0 +1,1 @@
+"""The scene: one layout, its physics, its camera (Section Setup)."""

@@ -1,0 +1,115 @@
+"""The walled arena in MuJoCo (Section Setup): many navigators stepped at once.
+
+Physics runs at 60 Hz and control at 10 Hz. An action is a body-frame velocity (vx, vy, omega) in [-1, 1]^3, scaled
+to 0.5 m/s and 1.5 rad/s. The slab is solid, so a step in contact with it is a step wasted, not a shortcut.
+"""
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from mujoco.batch import Batch
+
+from lt_lib.envs.layout import Box, Layout
+
+PHYSICS_HZ = 60
+CONTROL_HZ = 10
+V_MAX = 0.5  # m/s
+W_MAX = 1.5  # rad/s
+HORIZON = 600  # control steps
+CONTACT = 0.005  # metres: nearer than this counts as touching
+NO_CORRIDOR = -1
+
+MASS, GAIN, FORCE = 1.0, 100.0, 20.0  # kg, N s/m, N: full speed within three physics steps, no push through a wall
+
+
+class Arena:
+    """n independent scenes; `pose` (n, 3) holds the navigators' metres, metres, radians.
+
+    `contact` (n,) is whether the navigator touches the slab, `reached` (n,) whether it is at the goal and
+    `corridor` (n,) the corridor that it stands in (0 left, 1 right, -1 none), all after the latest step.
+    """
+
+    def __init__(self, layout: Layout, n: int):
+        self.layout = layout
+        self._batch = Batch(mujoco.MjModel.from_xml_string(physics_xml(layout)), n, nthread=1)
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl, self._mocap = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
+        self._warm = self._batch.bind("qacc_warmstart")
+        self._slab_centre = np.array([_centre(layout.slab(side)) for side in (0, 1)])
+        self.slab = np.zeros(n, np.int64)
+        self.scout = np.tile(layout.scout.array, (n, 1))
+
+    @property
+    def n(self) -> int:
+        return len(self._qpos)
+
+    @property
+    def pose(self) -> Float[np.ndarray, "n 3"]:
+        return self._qpos.copy()
+
+    def reset(self, which: Bool[np.ndarray, "n"], pose: Float[np.ndarray, "n 3"], slab: Int[np.ndarray, "n"], scout: Float[np.ndarray, "n 3"]):
+        """Starts new episodes in the scenes of `which`: navigator and scout poses, blocked corridor (0 left, 1 right)."""
+        self._qpos[which], self._qvel[which], self._warm[which] = pose[which], 0.0, 0.0
+        self.slab[which], self.scout[which] = slab[which], scout[which]
+        self._mocap[which, 0, :2] = self._slab_centre[slab[which]]
+        self._mocap[which, 1, :2] = scout[which, :2]
+        self._observe()
+
+    def step(self, action: Float[np.ndarray, "n 3"]):
+        """One control step of 0.1 s; actions are clipped to [-1, 1]."""
+        vx, vy, turn = np.clip(action, -1.0, 1.0).T
+        cos, sin = np.cos(self._qpos[:, 2]), np.sin(self._qpos[:, 2])
+        self._ctrl[:, 0] = V_MAX * (cos * vx - sin * vy)
+        self._ctrl[:, 1] = V_MAX * (sin * vx + cos * vy)
+        self._ctrl[:, 2] = W_MAX * turn
+        self._batch.step(nstep=PHYSICS_HZ // CONTROL_HZ)
+        self._observe()
+
+    def _observe(self):
+        x, y = self._qpos[:, 0], self._qpos[:, 1]
+        left, right = self.layout.routes
+        gap = np.where(self.slab == 0, left.slab.distance(x, y), right.slab.distance(x, y))
+        self.contact = gap < self.layout.robot.radius + CONTACT
+        self.reached = np.hypot(x - self.layout.goal.x, y - self.layout.goal.y) < self.layout.goal.radius
+        self.corridor = np.where(left.contains(x, y), 0, np.where(right.contains(x, y), 1, NO_CORRIDOR))
+
+
+def _centre(box: Box):
+    x0, x1, y0, y1 = box.bounds
+    return (x0 + x1) / 2, (y0 + y1) / 2
+
+
+def physics_xml(layout: Layout) -> str:
+    """MJCF of what can be bumped into; planar, without a floor, the robot's disc as a sphere."""
+    walls = "".join(_solid(wall) for wall in layout.walls)
+    slab = layout.slab(0)
+    (cx, cy), (x0, x1, y0, y1) = _centre(slab), slab.bounds
+    centred = Box((x0 - cx, x1 - cx, y0 - cy, y1 - cy), layout.wall_height, "slab")
+    radius = layout.robot.radius
+    return f"""
+<mujoco>
+  <option timestep="{1 / PHYSICS_HZ}" integrator="implicitfast" gravity="0 0 0"/>
+  <default><geom condim="1" contype="1" conaffinity="2"/></default>
+  <worldbody>
+    {walls}
+    <body name="slab" mocap="true">{_solid(centred)}</body>
+    <body name="scout" mocap="true" pos="0 0 {radius}"><geom type="sphere" size="{radius}"/></body>
+    <body name="navigator" pos="0 0 {radius}">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="y" type="slide" axis="0 1 0"/>
+      <joint name="heading" type="hinge" axis="0 0 1"/>
+      <geom type="sphere" size="{radius}" mass="{MASS}" contype="2" conaffinity="1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity joint="x" kv="{GAIN}" forcerange="-{FORCE} {FORCE}"/>
+    <velocity joint="y" kv="{GAIN}" forcerange="-{FORCE} {FORCE}"/>
+    <velocity joint="heading" kv="{GAIN / 100}"/>
+  </actuator>
+</mujoco>"""
+
+
+def _solid(box: Box) -> str:
+    x0, x1, y0, y1 = box.bounds
+    centre = f"{(x0 + x1) / 2:.6f} {(y0 + y1) / 2:.6f} {box.height / 2:.6f}"
+    return f'<geom type="box" pos="{centre}" size="{(x1 - x0) / 2:.6f} {(y1 - y0) / 2:.6f} {box.height / 2:.6f}"/>'

@@ -1,0 +1,224 @@
+"""The one description of the scene (Fig. 1b), in metres; physics, camera and occlusion check are made from it."""
+
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import yaml
+from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+
+from lt_lib.params import ROOT, Settings, UserError
+
+FOLDER = ROOT / "params" / "layouts"
+LEFT, RIGHT = 0, 1
+SIDES = ("left", "right")
+OUTER_THICKNESS = 0.1  # metres
+
+
+def _ordered(value):
+    low, high = value
+    if not low < high:
+        raise ValueError(f"an interval needs low < high, got {list(value)}")
+    return float(low), float(high)
+
+
+Interval = Annotated[tuple[float, float], BeforeValidator(_ordered)]
+Jitter = Annotated[tuple[float, float, float], BeforeValidator(tuple)]
+
+
+class Rect(Settings):
+    """An upright box's footprint, metres."""
+
+    x: Interval
+    y: Interval
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        return (*self.x, *self.y)
+
+    def contains(self, x, y):
+        """Whether points (metres) lie inside; broadcasts."""
+        return (self.x[0] <= x) & (x <= self.x[1]) & (self.y[0] <= y) & (y <= self.y[1])
+
+    def distance(self, x, y):
+        """Distance (metres) of points to the box, 0 inside; broadcasts."""
+        dx = np.maximum(np.maximum(self.x[0] - x, x - self.x[1]), 0.0)
+        dy = np.maximum(np.maximum(self.y[0] - y, y - self.y[1]), 0.0)
+        return np.hypot(dx, dy)
+
+
+class Corridor(Settings):
+    """Free rectangles cut out of the barrier, from the mouth on, and the slab that can block them."""
+
+    legs: Annotated[tuple[Rect, ...], BeforeValidator(tuple), Field(min_length=1)]
+    slab: Rect
+
+    def contains(self, x, y):
+        return np.logical_or.reduce([leg.contains(x, y) for leg in self.legs])
+
+
+class Corridors(Settings):
+    left: Corridor
+    right: Corridor
+
+
+class Robot(Settings):
+    radius: PositiveFloat
+    height: PositiveFloat
+
+
+class Camera(Settings):
+    """A forward pinhole camera on the robot's axis; `fov` in degrees, square frames."""
+
+    height: PositiveFloat
+    fov: Annotated[float, Field(gt=0, lt=180)]
+    pixels: PositiveInt
+
+
+class Pose(Settings):
+    """Position in metres, heading in degrees from the x axis."""
+
+    x: float
+    y: float
+    heading: float
+
+    @property
+    def array(self) -> np.ndarray:
+        """(3,) metres, metres, radians."""
+        return np.array([self.x, self.y, np.deg2rad(self.heading)])
+
+
+class JitteredPose(Pose):
+    """A pose drawn anew every episode, uniformly within +- jitter (metres, metres, degrees)."""
+
+    jitter: Jitter
+
+    def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """n poses, (n, 3) metres, metres, radians."""
+        spread = np.array([self.jitter[0], self.jitter[1], np.deg2rad(self.jitter[2])])
+        return self.array + rng.uniform(-1, 1, (n, 3)) * spread
+
+
+class Goal(Settings):
+    x: float
+    y: float
+    radius: PositiveFloat
+
+
+class Box(NamedTuple):
+    """An upright box standing on the floor: footprint (x0, x1, y0, y1) and height in metres, and its material."""
+
+    bounds: tuple[float, float, float, float]
+    height: float
+    material: str
+
+
+class Layout(Settings):
+    """The scene. Use `load_layout` to read one; its geometry is checked when it is read."""
+
+    name: str
+    arena: Rect
+    wall_height: PositiveFloat
+    barrier: Interval
+    corridors: Corridors
+    slab_height: PositiveFloat
+    robot: Robot
+    camera: Camera
+    spawn: JitteredPose
+    scout: JitteredPose
+    goal: Goal
+    choice_points: Annotated[tuple[Pose, ...], BeforeValidator(tuple), Field(min_length=2)]
+    communication_radius: PositiveFloat
+
+    @property
+    def routes(self) -> tuple[Corridor, Corridor]:
+        return self.corridors.left, self.corridors.right
+
+    @cached_property
+    def walls(self) -> tuple[Box, ...]:
+        """The four outer walls and what is left of the barrier once the corridors are cut out."""
+        (x0, x1), (y0, y1), t = self.arena.x, self.arena.y, OUTER_THICKNESS
+        outer = [(x0 - t, x0, y0 - t, y1 + t), (x1, x1 + t, y0 - t, y1 + t), (x0, x1, y0 - t, y0), (x0, x1, y1, y1 + t)]
+        return (
+            *(Box(b, self.wall_height, "wall") for b in outer),
+            *(Box(b, self.wall_height, "barrier") for b in self._barrier_blocks()),
+        )
+
+    def _barrier_blocks(self) -> list[tuple[float, float, float, float]]:
+        legs = [leg for corridor in self.routes for leg in corridor.legs]
+        cuts = sorted({*self.barrier, *(x for leg in legs for x in leg.x if self.barrier[0] < x < self.barrier[1])})
+        open_blocks, done = {}, []  # y interval -> x where the block began
+        for x0, x1 in zip(cuts[:-1], cuts[1:], strict=True):
+            solid = set(_complement([leg.y for leg in legs if leg.x[0] <= x0 and x1 <= leg.x[1]], self.arena.y))
+            done += [(start, x0, *y) for y, start in open_blocks.items() if y not in solid]
+            open_blocks = {y: open_blocks.get(y, x0) for y in solid}
+        done += [(start, self.barrier[1], *y) for y, start in open_blocks.items()]
+        return sorted(done)
+
+    def slab(self, side: int) -> Box:
+        """The hazard slab in the left (0) or right (1) corridor."""
+        return Box(self.routes[side].slab.bounds, self.slab_height, "slab")
+
+    def free(self, x, y, clearance: float = 0.0):
+        """Whether a disc of radius `clearance` (metres) at the points touches no wall; broadcasts."""
+        clear = [Rect(x=b.bounds[:2], y=b.bounds[2:]).distance(x, y) > clearance for b in self.walls]
+        return self.arena.contains(x, y) & np.logical_and.reduce(clear)
+
+    @model_validator(mode="after")
+    def _sound(self):
+        if not self.slab_height <= self.wall_height:
+            raise ValueError(f"slab_height {self.slab_height} m must not exceed wall_height {self.wall_height} m")
+        if not self.camera.height < self.wall_height:
+            raise ValueError(f"camera.height {self.camera.height} m must be below wall_height {self.wall_height} m")
+        for side, corridor in zip(SIDES, self.routes, strict=True):
+            self._check_corridor(side, corridor)
+        for name in ("spawn", "scout", "goal"):
+            self._check_standing(name, getattr(self, name))
+        for i, point in enumerate(self.choice_points):
+            self._check_standing(f"choice_points[{i}]", point)
+        return self
+
+    def _check_corridor(self, side: str, corridor: Corridor):
+        width = 2 * self.robot.radius
+        for i, leg in enumerate(corridor.legs):
+            narrow = min(leg.x[1] - leg.x[0], leg.y[1] - leg.y[0])
+            if narrow <= width:
+                raise ValueError(
+                    f"corridors.{side}.legs[{i}] is {narrow:.2f} m wide, narrower than the robot ({width:.2f} m); "
+                    f"make it wider than {width:.2f} m"
+                )
+
+    def _check_standing(self, name: str, place):
+        if not self.free(place.x, place.y, self.robot.radius):
+            raise ValueError(f"{name} at ({place.x}, {place.y}) stands in a wall; move it into the free arena")
+
+
+def _complement(holes, whole):
+    """The parts of the interval `whole` that no interval of `holes` covers."""
+    edge, solid = whole[0], []
+    for low, high in sorted(holes):
+        if low > edge:
+            solid.append((edge, low))
+        edge = max(edge, high)
+    return [*solid, (edge, whole[1])] if edge < whole[1] else solid
+
+
+def load_layout(name: str) -> Layout:
+    """Reads params/layouts/<name>.yaml, or a path to a yaml file of one's own.
+
+    Raises UserError, one line, for an unknown name or a scene that cannot be (a corridor narrower than the
+    robot, a robot in a wall, a missing or unknown key).
+    """
+    path = Path(name) if name.endswith(".yaml") else FOLDER / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
+        raise UserError(f"unknown layout '{name}'; known: {known}, or the path of a .yaml file")
+    try:
+        return Layout(**yaml.safe_load(path.read_text()))
+    except (yaml.YAMLError, TypeError) as error:
+        raise UserError(f"layout {path.name}: not a yaml mapping ({str(error).splitlines()[0]})") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise UserError(f"layout {path.name}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}") from error

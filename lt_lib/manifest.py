@@ -1,0 +1,64 @@
+"""What an outputs folder was made with: library versions, commit, machine, and seconds a notebook."""
+
+import json
+import os
+import platform
+import re
+import subprocess
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from lt_lib.files import write_atomically
+
+
+def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str, Mapping[str, Any]]) -> None:
+    """Writes the manifest; what an earlier one says of notebooks that did not run this time stays.
+
+    notebooks: {name: {"status": text, "seconds": float}} of this time.
+    """
+    earlier = json.loads(path.read_text(encoding="utf-8"))["notebooks"] if path.exists() else {}
+    commit = git_state(root)
+    executed = {name: dict(entry) | commit for name, entry in notebooks.items()}
+    manifest = {
+        "profile": profile,
+        "versions": versions(root / "requirements.txt"),
+        "machine": machine(),
+        "notebooks": dict(sorted((earlier | executed).items())),
+    }
+    write_atomically(path, (json.dumps(manifest, indent=2) + "\n").encode())
+
+
+def versions(requirements: Path) -> dict[str, str]:
+    """Python's version and that of every library pinned in a requirements file, as they are installed."""
+    names = re.findall(r"^([\w.-]+)==", requirements.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {"python": platform.python_version()} | {name: metadata.version(name) for name in names}
+
+
+def git_state(root: Path) -> dict[str, Any]:
+    """The commit that is checked out and whether anything but outputs differs from it; None and None outside git."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--", ".", ":!outputs")
+        return {"commit": git("rev-parse", "HEAD"), "uncommitted_changes": bool(changed)}
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": None, "uncommitted_changes": None}
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores that we may use, and memory in GiB."""
+    info = Path("/proc/cpuinfo")
+    models = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", flags=re.MULTILINE)
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "cpu": models[0] if models else platform.processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
+    }

@@ -1,0 +1,265 @@
+"""Validated settings: the base class of every configuration, and the profiles that run_all.py hands to the notebooks."""
+
+import ast
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class UserError(Exception):
+    """A mistake in what a person gave us; the message is one line that names it and says what would be right."""
+
+
+def _frozen(value: Any) -> Any:
+    """Lists as tuples, at any depth, since yaml and notebooks can only write lists."""
+    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
+
+
+class Settings(BaseModel):
+    """Base of every configuration: immutable, strictly typed, unknown keys refused; lists are taken for tuples."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_as_tuples(cls, values: Any) -> Any:
+        if isinstance(values, dict):
+            return {name: _frozen(value) for name, value in values.items()}
+        return values
+
+
+def profile_names(root: Path = ROOT) -> list[str]:
+    """The profiles of a project: every yaml file in params/ but the paper's claims."""
+    return sorted(path.stem for path in (root / "params").glob("*.yaml") if path.stem != "claims")
+
+
+def notebook_names(root: Path = ROOT) -> list[str]:
+    """The notebooks of a project in numeric order, e.g. '04_pixels'."""
+    return sorted(path.stem for path in (root / "notebooks").glob("[0-9][0-9]_*.ipynb"))
+
+
+def notebook_defaults(path: Path) -> dict[str, Any]:
+    """The names and literal values assigned in the one cell of a notebook that is tagged 'parameters'."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    tagged = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
+    if len(tagged) != 1:
+        raise UserError(f"{path.name}: expected exactly one cell tagged 'parameters', found {len(tagged)}")
+    body = ast.parse("".join(tagged[0]["source"])).body
+    try:
+        return {node.targets[0].id: ast.literal_eval(node.value) for node in body}
+    except (AttributeError, ValueError):
+        raise UserError(f"{path.name}: the parameters cell may hold only lines such as name = literal") from None
+
+
+def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
+    """What a profile gives to each notebook: {notebook: {parameter: value}}, everything checked.
+
+    A notebook's own section goes over `shared`, whose keys reach every notebook that declares them. A value
+    replaces the notebook's default as a whole, dicts included.
+
+    Raises UserError for an unknown profile, notebook or parameter, and for a value of the wrong type or range.
+    """
+    if name not in profile_names(root):
+        raise UserError(f"unknown profile {name!r}; there are {', '.join(profile_names(root))}")
+    defaults = {book: notebook_defaults(root / "notebooks" / f"{book}.ipynb") for book in notebook_names(root)}
+    sections = _read_sections(root / "params" / f"{name}.yaml", defaults)
+    shared = sections.pop("shared", {})
+    profile = {}
+    for book, declared in defaults.items():
+        given = {key: value for key, value in shared.items() if key in declared} | sections.get(book, {})
+        for key, value in given.items():
+            _check_value(f"{name}.yaml: {book}", key, value, declared)
+        profile[book] = given
+    return profile
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """yaml as it is meant: a key given twice is an error, not the last one's win."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        for key, count in Counter(self.construct_object(key) for key, _ in node.value).items():
+            if count > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"{key!r} is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dict[str, Any]]:
+    """The sections of a profile's file, once every notebook and every shared parameter in it is known."""
+    try:
+        sections = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeys) or {}
+    except yaml.YAMLError as error:
+        raise UserError(f"{path.name}: not valid yaml: {' '.join(str(error).split())}") from None
+    if not isinstance(sections, dict):
+        raise UserError(f"{path.name}: expected sections such as 'shared:', got {sections!r}")
+    for section, values in sections.items():
+        if section != "shared" and section not in defaults:
+            raise UserError(f"{path.name}: unknown notebook {section!r}; there are {', '.join(defaults)}")
+        if not isinstance(values, dict):
+            raise UserError(f"{path.name}: {section}: expected parameters in braces or below it, got {values!r}")
+    declared = {key for names in defaults.values() for key in names}
+    for key in sections.get("shared", {}):
+        if key not in declared:
+            raise UserError(f"{path.name}: shared: no notebook declares {key!r}; there are {_listed(declared)}")
+    return sections
+
+
+def _check_value(where: str, key: str, value: Any, declared: Mapping[str, Any]) -> None:
+    """A parameter must be declared by its notebook, have the type of its default, and satisfy SECTIONS."""
+    if key not in declared:
+        raise UserError(f"{where}: unknown parameter {key!r}; there are {_listed(declared)}")
+    if not _same_type(value, declared[key]):
+        expected = type(declared[key]).__name__
+        raise UserError(f"{where}: {key}: expected {expected} such as {declared[key]!r}, got {value!r}")
+    if key in SECTIONS:
+        try:
+            TypeAdapter(SECTIONS[key]).validate_python(value, strict=True)
+        except ValidationError as error:
+            raise UserError(f"{where}: {explain(error, key, SECTIONS[key])}") from None
+    elif isinstance(value, dict):
+        raise UserError(f"{where}: {key}: SECTIONS has no settings for it; there are {_listed(SECTIONS)}")
+
+
+def _same_type(value: Any, default: Any) -> bool:
+    """Whether a value may stand for a default: the same type, or an int for a float; lists hold what theirs holds."""
+    if isinstance(default, list) and isinstance(value, list) and default:
+        return all(any(_same_type(item, example) for example in default) for item in value)
+    return type(value) is type(default) or (type(default) is float and type(value) is int)
+
+
+def explain(error: ValidationError, name: str, settings: Any) -> str:
+    """The first complaint of pydantic in one line, e.g. 'encoder.frames: must be greater than 0, got -1'."""
+    first = error.errors()[0]
+    place = ".".join([name, *map(str, first["loc"])])
+    if first["type"] == "extra_forbidden":
+        return f"{place}: unknown parameter; {name} has {_listed(settings.model_fields)}"
+    complaint = first["msg"].replace("Input should be", "must be")
+    return f"{place}: {complaint}, got {first['input']!r}"
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(sorted(names))
+
+
+# --- settings
+Share = Annotated[float, Field(ge=0, le=1)]
+Precision = Literal["float32", "bfloat16"]
+Content = Literal["floor", "position", "trajectory", "latent", "predicted", "raw", "oracle"]
+Wire = Literal["intact", "content_zeroed", "wire_zeroed", "sender_shuffled", "matched_noise"]
+
+
+class Training(Settings):
+    """What every training shares: the scene, and the device ('auto' is cuda where there is one)."""
+
+    layout: str = "default"
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+
+
+class EncoderConfig(Training):
+    """Stage 1 (Section Implementation); loss weights are ours, see ASSUMPTIONS.md."""
+
+    frames: PositiveInt = 204_800
+    rollout: Annotated[int, Field(ge=2)] = 32  # frames a rollout
+    epochs: NonNegativeFloat = 2.5
+    batch: Annotated[int, Field(ge=2)] = 256
+    lr: PositiveFloat = 1e-3
+    ema: Annotated[float, Field(ge=0, lt=1)] = 0.99
+    prediction: NonNegativeFloat = 1.0
+    variance: NonNegativeFloat = 1.0
+    covariance: NonNegativeFloat = 0.1
+    reconstruction: NonNegativeFloat = 1.0
+
+
+class GateConfig(Training):
+    """How the freeze gates are measured: held-out rollouts, and how many latents to show."""
+
+    rollouts: Annotated[int, Field(ge=10)] = 640
+    length: PositiveInt = 32
+    shown: PositiveInt = 4_000
+
+
+class Gates(Settings):
+    """The pre-registered thresholds; the defaults are the paper's measured hazard probe and ours for the rest."""
+
+    hazard: Share = 0.935
+    walls: Annotated[float, Field(le=1)] = 0.95
+    rank: NonNegativeFloat = 40.0
+
+
+class PpoConfig(Settings):
+    """The settings that every policy, seed and condition shares (Section Implementation)."""
+
+    clip: PositiveFloat = 0.2
+    epochs: PositiveInt = 4
+    entropy: NonNegativeFloat = 0.01
+    gamma: Share = 0.99
+    lam: Share = 0.95
+
+
+class ExecutorConfig(Training):
+    """The low-level controller's pretraining (Section Implementation)."""
+
+    steps: PositiveInt = 1_000_000
+    envs: PositiveInt = 64
+    rollout: PositiveInt = 128  # control steps an environment and update
+    minibatch: PositiveInt = 1024
+    lr: PositiveFloat = 2.5e-4
+    ppo: PpoConfig = PpoConfig()
+    precision: Precision = "float32"
+
+
+class BankConfig(Training):
+    """Episodes of the frozen executor for every (draw of the scene, slab, route), shared by all message contents."""
+
+    entries: PositiveInt = 2048  # draws of spawn and scout pose
+    envs: PositiveInt = 64
+    commit_step: NonNegativeInt = 2
+    precision: Precision = "float32"
+
+
+class HeadConfig(Training):
+    """Stage 2: the route head, trained from episode reward alone (Section Implementation)."""
+
+    content: Content
+    wire: Wire = "intact"
+    held_out: Share = 0.125  # of the bank's draws, kept for evaluation
+    episodes: PositiveInt = 6_000
+    batch: PositiveInt = 256
+    minibatch: PositiveInt = 64
+    lr: PositiveFloat = 3e-3
+    ppo: PpoConfig = PpoConfig()
+
+
+class EvaluationConfig(Training):
+    """One cell of Table IV: a frozen head under one wire condition."""
+
+    content: Content
+    wire: Wire
+    held_out: Share = 0.125
+    episodes: PositiveInt = 256
+
+
+SECTIONS: dict[str, type[Settings]] = {
+    "encoder": EncoderConfig,
+    "probe": GateConfig,
+    "gates": Gates,
+    "executor": ExecutorConfig,
+    "bank": BankConfig,
+}

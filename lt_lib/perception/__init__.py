@@ -1,0 +1,1 @@
+"""From frames to frozen latents (Section Encoder and freeze)."""

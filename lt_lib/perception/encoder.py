@@ -1,0 +1,79 @@
+"""The encoder E and predictor P (Sections Encoder and freeze, Implementation), and their frozen form."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from lt_lib.envs.camera import network_input
+
+LATENT = 64
+ACTION = 3
+
+
+class Encoder(nn.Module):
+    """Frames (B, H, W, 3) in [0, 1] to raw latents (B, 64)."""
+
+    def __init__(self):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, 32, kernel_size=8, stride=4), nn.ReLU(),  # (B, 32, 15, 15)
+            nn.Conv2d(32, 64, kernel_size=4, stride=2), nn.ReLU(),  # (B, 64, 6, 6)
+            nn.Conv2d(64, 64, kernel_size=3, stride=1), nn.ReLU(),  # (B, 64, 4, 4)
+            nn.Flatten(), nn.Linear(1024, LATENT),
+        ).to(memory_format=torch.channels_last)
+
+    def forward(self, frames: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 64"]:
+        return self.layers(frames.permute(0, 3, 1, 2))  # a channels-last view, no copy
+
+
+class Predictor(nn.Module):
+    """Raw latent and action to the next raw latent (the paper's z-hat), as a residual."""
+
+    def __init__(self):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(LATENT + ACTION, 128), nn.ReLU(), nn.Linear(128, LATENT))
+
+    def forward(self, latent: Float[Tensor, "b 64"], action: Float[Tensor, "b 3"]) -> Float[Tensor, "b 64"]:
+        return latent + self.layers(torch.cat([latent, action], dim=1))
+
+
+class FrozenEncoder:
+    """E and P after the freeze: no gradient ever, and a normalisation that was fixed before any policy existed.
+
+    Built from a flat mapping of arrays ("E.*", "P.*", "mean", "std"), the form in which weights are stored and
+    handed to runs. `precision` is float32 (the reference) or bfloat16 (faster on CPUs that have it).
+    """
+
+    def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu", precision: str = "float32"):
+        self.device, self._dtype = torch.device(device), getattr(torch, precision)
+        self._encoder, self._predictor = Encoder(), Predictor()
+        for module, prefix in ((self._encoder, "E."), (self._predictor, "P.")):
+            module.load_state_dict({k.removeprefix(prefix): torch.tensor(v) for k, v in weights.items() if k.startswith(prefix)})
+            module.to(self.device, self._dtype).requires_grad_(False)
+        self._encoder.to(memory_format=torch.channels_last)
+        self._mean = torch.tensor(weights["mean"], device=self.device)
+        self._std = torch.tensor(weights["std"], device=self.device)
+
+    @torch.inference_mode()
+    def latent(self, frames: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b 64"]:
+        """Normalised latents of palette-index frames."""
+        return self._normalised(self._raw(frames))
+
+    @torch.inference_mode()
+    def predicted(self, frames: UInt8[np.ndarray, "b h w"], action: Float[Tensor, "b 3"]) -> Float[Tensor, "b 64"]:
+        """Normalised latents that P predicts for the next frame under an action."""
+        return self._normalised(self._predictor(self._raw(frames), action.to(self.device, self._dtype)))
+
+    def _raw(self, frames):
+        return self._encoder(torch.from_numpy(network_input(frames)).to(self.device, self._dtype))
+
+    def _normalised(self, latent):
+        return (latent.float() - self._mean) / self._std
+
+
+def best_device(name: str) -> str:
+    """'auto' is cuda where there is one, else cpu."""
+    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name

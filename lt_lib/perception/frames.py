@@ -1,0 +1,72 @@
+"""Frames for the encoder: random rollouts from uniform free poses, without labels or reward (Section Implementation)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from lt_lib.envs.arena import Arena
+from lt_lib.envs.camera import HAZARD, WALLS, FastCamera
+from lt_lib.envs.layout import Layout
+
+HOLD = 0.9  # chance that a random action is kept for another step; otherwise it is drawn anew
+ARENAS = 640  # rollouts stepped side by side
+
+
+class Rollouts(NamedTuple):
+    """frames (R, T, H, W) palette indices; actions (R, T, 3) in [-1, 1]; poses (R, T, 3) metres, metres, radians."""
+
+    frames: UInt8[np.ndarray, "r t h w"]
+    actions: Float[np.ndarray, "r t 3"]
+    poses: Float[np.ndarray, "r t 3"]
+
+
+def random_rollouts(layout: Layout, rollouts: int, length: int, rng: np.random.Generator) -> Rollouts:
+    """Rollouts of `length` frames; the slab's corridor and the other robot's place are drawn anew for each."""
+    parts = [_rollouts(layout, min(ARENAS, rollouts - start), length, rng) for start in range(0, rollouts, ARENAS)]
+    return Rollouts(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _rollouts(layout: Layout, n: int, length: int, rng: np.random.Generator) -> Rollouts:
+    arena, camera = Arena(layout, n), FastCamera(layout)
+    slab = rng.integers(0, 2, n)
+    other = free_poses(layout, slab, rng)
+    pose = free_poses(layout, slab, rng, apart_from=other)
+    arena.reset(np.ones(n, bool), pose, slab, other)
+    frames, actions, poses = [], [], []
+    action = rng.uniform(-1, 1, (n, 3))
+    for _ in range(length):
+        frames.append(camera.frames(arena.pose, slab, other[:, :2]))
+        poses.append(arena.pose)
+        action = np.where(rng.random((n, 1)) < HOLD, action, rng.uniform(-1, 1, (n, 3)))
+        actions.append(action.astype(np.float32))
+        arena.step(action)
+    return Rollouts(*(np.stack(part, axis=1) for part in (frames, actions, poses)))
+
+
+def free_poses(layout: Layout, slab: Int[np.ndarray, "n"], rng: np.random.Generator, apart_from=None) -> Float[np.ndarray, "n 3"]:
+    """Poses uniform over the free arena, clear of walls, of the slab and of other robots (n, 2 or 3)."""
+    n, radius = len(slab), layout.robot.radius
+    pose, missing = np.empty((n, 3)), np.ones(n, bool)
+    low, high = np.array([layout.arena.x, layout.arena.y]).T
+    while missing.any():
+        xy = rng.uniform(low, high, (n, 2))
+        x, y = xy.T
+        gap = np.where(slab == 0, layout.routes[0].slab.distance(x, y), layout.routes[1].slab.distance(x, y))
+        good = layout.free(x, y, radius) & (gap > radius)
+        if apart_from is not None:
+            good &= np.hypot(*(xy - apart_from[:, :2]).T) > 2 * radius
+        take = missing & good
+        pose[take] = np.column_stack([xy, rng.uniform(-np.pi, np.pi, n)])[take]
+        missing &= ~take
+    return pose
+
+
+def hazard_visible(frames: UInt8[np.ndarray, "*batch h w"]):
+    """Whether a frame shows the slab; used by the probes and the pictures, never by training."""
+    return HAZARD[frames].any(axis=(-1, -2))
+
+
+def wall_pixels(frames: UInt8[np.ndarray, "*batch h w"]):
+    """How many of a frame's pixels show a wall; likewise."""
+    return WALLS[frames].sum(axis=(-1, -2))

@@ -1,0 +1,107 @@
+"""The freeze gates (Section Encoder and freeze): what a checkpoint must show before it may be frozen.
+
+Linear probes say whether the content that a teammate would need is decodable, an effective rank whether the latent has
+collapsed. All are measured on rollouts that the encoder never saw; a rollout's frames are correlated, so the rollout
+is the unit of every interval and of the split into probe training and test.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from scipy.stats import t
+from sklearn.linear_model import LinearRegression, LogisticRegression
+
+from lt_lib.envs.layout import load_layout
+from lt_lib.params import GateConfig, Gates, UserError
+from lt_lib.perception.encoder import LATENT, FrozenEncoder, best_device
+from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixels
+
+PROBE_SHARE = 0.7  # of the held-out rollouts train the probes, the rest test them
+CHUNK = 1024
+
+
+class GateError(UserError):
+    """A checkpoint that failed a gate; the message says which and by how much."""
+
+
+class Measured(NamedTuple):
+    """What `measure_gates` found; accuracies and R^2 on test rollouts."""
+
+    hazard: float  # accuracy of the linear hazard-visible probe
+    hazard_low: float  # 95% Student-t interval over rollouts
+    hazard_high: float
+    majority: float  # accuracy of always guessing the commoner answer
+    walls: float  # R^2 of the linear wall-count probe
+    rank: float  # exponential of the entropy of the normalised singular values
+    rank_eigen: float  # the same of the covariance's eigenvalues
+
+
+def effective_rank(latent: Float[np.ndarray, "b d"], power: int = 1) -> float:
+    """exp of the spectral entropy of the centred latents' singular values, raised to `power` (2: eigenvalues)."""
+    spectrum = np.linalg.svd(latent - latent.mean(axis=0), compute_uv=False) ** power
+    share = spectrum / spectrum.sum()
+    return float(np.exp(-(share * np.log(np.maximum(share, 1e-300))).sum()))
+
+
+def encode(encoder: FrozenEncoder, frames: UInt8[np.ndarray, "*batch h w"]) -> Float[np.ndarray, "*batch d"]:
+    """Normalised latents of any number of frames."""
+    flat = frames.reshape(-1, *frames.shape[-2:])
+    latents = torch.cat([encoder.latent(flat[i : i + CHUNK]).cpu() for i in range(0, len(flat), CHUNK)])
+    return latents.numpy().reshape(*frames.shape[:-2], LATENT)
+
+
+def measure_gates(config: GateConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray]) -> dict:
+    """Probes and rank of a checkpoint on held-out rollouts; also the latents' picture.
+
+    Fields of `Measured`, and for `config.shown` frames: "latent.plane" (n, 2) first two principal components,
+    "latent.pose" (n, 3), "latent.hazard" (n,) pixels of hazard.
+    """
+    rng = np.random.default_rng([seed, 5])
+    rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
+    latents = encode(FrozenEncoder(encoder, best_device(config.device)), rollouts.frames)  # (R, T, 64)
+    report(0.5)
+    visible, walls = hazard_visible(rollouts.frames), wall_pixels(rollouts.frames)
+    cut = int(len(latents) * PROBE_SHARE)
+    train, test = latents[:cut].reshape(-1, LATENT), latents[cut:].reshape(-1, LATENT)
+    probe = LogisticRegression(max_iter=2000).fit(train, visible[:cut].ravel())
+    right = (probe.predict(test) == visible[cut:].ravel()).reshape(visible[cut:].shape).mean(axis=1)  # per rollout
+    low, high = t.interval(0.95, len(right) - 1, loc=right.mean(), scale=right.std(ddof=1) / np.sqrt(len(right)))
+    wall_probe = LinearRegression().fit(train, walls[:cut].ravel())
+    commoner = visible[:cut].mean() > 0.5
+    found = Measured(
+        float(right.mean()), float(low), float(min(high, 1.0)), float((visible[cut:] == commoner).mean()),
+        float(wall_probe.score(test, walls[cut:].ravel())),
+        effective_rank(latents.reshape(-1, LATENT)), effective_rank(latents.reshape(-1, LATENT), power=2),
+    )
+    return found._asdict() | _picture(rollouts, latents, config.shown, rng)
+
+
+def _picture(rollouts, latents, n: int, rng: np.random.Generator) -> dict:
+    frames = rollouts.frames.reshape(-1, *rollouts.frames.shape[2:])
+    flat = latents.reshape(-1, LATENT)
+    shown = rng.choice(len(flat), min(n, len(flat)), replace=False)
+    axes = np.linalg.svd(flat - flat.mean(0), full_matrices=False)[2][:2]
+    return {
+        "latent.plane": (flat[shown] - flat.mean(0)) @ axes.T,
+        "latent.pose": rollouts.poses.reshape(-1, 3)[shown],
+        "latent.hazard": hazard_visible(frames[shown]),
+    }
+
+
+def require_gates(found: Mapping[str, float], gates: Gates) -> None:
+    """Raises GateError unless the checkpoint passes every pre-registered gate."""
+    limits = {
+        "hazard": ("linear hazard-visible probe", max(gates.hazard, found["majority"])),
+        "walls": ("wall-count R^2", gates.walls),
+        "rank": ("effective rank", gates.rank),
+    }
+    failed = [
+        f"{words} {found[name]:.3f} is {limit - found[name]:.3f} short of {limit:.3f}"
+        for name, (words, limit) in limits.items()
+        if not found[name] >= limit
+    ]
+    if failed:
+        raise GateError("not frozen: " + "; ".join(failed))

@@ -1,0 +1,101 @@
+"""How far the runs in flight are, told through small files, since each works in a process of its own.
+
+`<store>/inflight/<process>/stage.json` tells of one fetch, `<store>/inflight/<process>/<key>.json` of one of its runs.
+"""
+
+import contextlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+import psutil
+from tqdm import tqdm
+
+
+class Reporter:
+    """What a run calls with its fraction done, 0 to 1; it is written down twice a second at most."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._written = float("-inf")
+
+    def __call__(self, fraction: float) -> None:
+        if time.monotonic() - self._written > 0.5:
+            _write(self._path, {"fraction": float(fraction)})
+            self._written = time.monotonic()
+
+
+@contextlib.contextmanager
+def stage(folder: Path, what: str, total: int) -> Iterator[tuple[Path, Callable[[str], None]]]:
+    """Tells of `total` runs until the block ends: (folder for their reporters' files, to call with a finished key).
+
+    On a terminal it draws a bar besides.
+    """
+    files = folder / "inflight" / str(os.getpid())
+    files.mkdir(parents=True, exist_ok=True)
+    _forget_ended(files.parent)
+    told = {"what": what, "done": 0, "total": total, "started": time.time()}
+
+    def finished(key: str) -> None:
+        told["done"] += 1
+        _write(files / "stage.json", told)
+        (files / f"{key}.json").unlink(missing_ok=True)
+        bar.update()
+
+    _write(files / "stage.json", told)
+    with tqdm(desc=what, total=total, disable=None) as bar:
+        try:
+            yield files, finished
+        finally:
+            rmtree(files, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fetch stands: runs done of all, the fraction with those in flight, seconds so far and to come."""
+
+    what: str
+    done: int
+    total: int
+    fraction: float
+    seconds: float
+    left: float | None
+
+
+def read_progress(folder: Path, since: float) -> Progress | None:
+    """The fetch in a store's folder that was last to start at or after `since` (seconds of the epoch), if any."""
+    stages = [(told["started"], path, told) for path in folder.glob("inflight/*/stage.json") if (told := _read(path))]
+    started, path, told = max(stages, default=(0.0, None, None), key=lambda stage: stage[0])
+    if path is None or started < since:
+        return None
+    in_flight = [_read(run).get("fraction", 0.0) for run in path.parent.glob("*.json") if run != path]
+    fraction = (told["done"] + sum(in_flight)) / told["total"]
+    seconds = time.time() - started
+    left = seconds * (1 - fraction) / fraction if fraction > 0 else None
+    return Progress(told["what"], told["done"], told["total"], fraction, seconds, left)
+
+
+def _forget_ended(inflight: Path) -> None:
+    """Removes what killed processes left."""
+    for files in inflight.iterdir():
+        if not psutil.pid_exists(int(files.name)):
+            rmtree(files, ignore_errors=True)
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    temporary = path.with_suffix(".new")
+    temporary.write_text(json.dumps(content), encoding="utf-8")
+    temporary.replace(path)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What a file tells; nothing if it went away meanwhile."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}

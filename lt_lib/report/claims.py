@@ -1,0 +1,302 @@
+"""The paper's claims, what a notebook finds for them, and the verdict on each.
+
+A notebook collects its findings and writes them at its end:
+
+    findings = Findings("04_pixels", folder, profile)
+    findings.add("px.latent.route", mean, seeds=seeds, low=low, high=high, test="over floor", p=p, holds=True)
+    findings.write()
+"""
+
+import json
+import math
+import operator
+import re
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from lt_lib.files import writable_folder, write_atomically
+from lt_lib.params import ROOT, Settings, UserError, explain
+
+Notebook = Literal[
+    "01_occlusion_check", "02_encoder", "03_gridworld", "04_pixels", "05_coverage_sweep",
+    "06_z_study", "07_corruption", "08_hardware_decode", "09_scoreboard",
+]  # fmt: skip
+Number = int | float
+Numbers = Number | tuple[Number, ...]
+Value = Number | str | tuple[Number, ...]
+
+CLAIMS = ROOT / "params" / "claims.yaml"
+JUDGED = ("full", "quick")  # a smaller profile gives no verdict, so that nobody takes it for a result
+REPRODUCED, SAME_DIRECTION, NOT_REPRODUCED = "reproduced", "same direction", "not reproduced"
+SURROGATE, NOT_RUN, NO_VERDICT = "surrogate", "not run", ""
+CRITERIA = ("digits", "margin", "at_least", "at_most", "equal", "between")
+ALLOWED = {
+    "exact": ("digits", "between"),
+    "config": (),
+    "scene": CRITERIA[2:],
+    "measured": CRITERIA[1:],
+    "hardware": CRITERIA[1:],
+}
+
+
+class Claim(Settings):
+    """One entry of claims.yaml, whose head explains every field."""
+
+    id: str
+    nb: Notebook
+    kind: Literal["exact", "config", "measured", "scene", "hardware"]
+    what: str
+    paper: Value
+    sd: float | None = None
+    n: int | None = None
+    range: tuple[float, float] | None = None
+    check: str = ""
+    unit: str = ""
+    digits: int | None = None
+    margin: Numbers | None = None
+    at_least: Number | None = None
+    at_most: Number | None = None
+    equal: Number | None = None
+    between: tuple[Number, Number] | None = None
+
+    @model_validator(mode="after")
+    def _criterion_suits_the_kind(self) -> "Claim":
+        criteria = [name for name in CRITERIA if getattr(self, name) is not None]
+        allowed = ALLOWED[self.kind]
+        if len(criteria) > 1 or not set(criteria) <= set(allowed):
+            raise UserError(f"{self.id}: kind {self.kind} takes at most one of {allowed}, got {criteria}")
+        if not criteria and self.kind != "config" and not self.check and numbers(self.paper):
+            raise UserError(f"{self.id}: not said when it is reproduced; give one of {allowed} or a check")
+        if isinstance(self.margin, tuple) and len(self.margin) != len(numbers(self.paper) or ()):
+            raise UserError(f"{self.id}: expected a margin for each of {self.paper}, got {self.margin}")
+        return self
+
+    @property
+    def criterion(self) -> str:
+        """The name of the one criterion that a machine reads, '' where there is none."""
+        return next((name for name in CRITERIA if getattr(self, name) is not None), "")
+
+    @property
+    def judged_in_words(self) -> bool:
+        """Whether only the notebook's own test can tell if the check is met."""
+        return bool(self.check) and not self.criterion and self.kind in ("measured", "hardware")
+
+
+class Finding(Settings):
+    """What a notebook found for one claim.
+
+    value         like the claim's: a number, words, "k of n", or a list (a pair, a range, one a case)
+    seeds         one value a seed, where there are seeds
+    low, high     95% interval of the value, a list where the value is one
+    n             number of seeds (or runs, episodes: what the value is a mean or count of)
+    test, p       the claim's own test in words and its p
+    holds         whether that test holds; None where the claim has no test
+    note          a few words for the reader of a deviation: what was tried, what the cause is
+    real_frames   (hardware) the frames came from the physical camera
+    """
+
+    value: Value
+    seeds: tuple[Number, ...] | None = None
+    low: Numbers | None = None
+    high: Numbers | None = None
+    n: Annotated[int, Field(gt=0)] | None = None
+    test: str = ""
+    p: Annotated[Number, Field(ge=0, le=1)] | None = None
+    holds: bool | None = None
+    note: str = ""
+    real_frames: bool = False
+
+
+def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
+    """Every claim by its id, in the file's order.
+
+    Raises UserError, one line with the id, for an unreadable file, an unknown key or notebook, a missing or
+    malformed value, an id given twice, and a criterion that does not suit the kind.
+    """
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise UserError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise UserError(f"{path.name}: expected a list of entries '- {{id: ..., nb: ..., ...}}'")
+    claims: dict[str, Claim] = {}
+    for entry in entries:
+        claim = _parse(Claim, entry, f"{path.name}: {entry.get('id')}")
+        if claim.id in claims:
+            raise UserError(f"{path.name}: {claim.id} is there twice")
+        claims[claim.id] = claim
+    return claims
+
+
+def _parse(model: type[Settings], entry: Mapping[str, Any], where: str) -> Any:
+    """An entry as a model, pydantic's complaint as one line."""
+    try:
+        return model(**entry)
+    except ValidationError as error:
+        raise UserError(explain(error, where, model)) from None
+
+
+def numbers(value: Value) -> tuple[Number, ...] | None:
+    """The numbers of a value: "k of n" is the proportion k / n, words have none."""
+    if isinstance(value, str):
+        count = re.fullmatch(r"(\d+) of ([1-9]\d*)", value)
+        return (int(count[1]) / int(count[2]),) if count else None
+    return value if isinstance(value, tuple) else (value,)
+
+
+def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
+    """The verdict on one claim.
+
+    not run          there is no finding
+    '' (none)        any profile but full and quick: the run was too small to tell
+    surrogate        a hardware claim not made from real frames; with real frames it counts as measured
+    reproduced       the claim's criterion is met (below), and its own test, where there is one, holds
+    same direction   a measured claim whose own test holds although the criterion is missed
+    not reproduced   everything else
+
+    The criterion, component by component for a list (a list beside one number: every component against it):
+    exact            prints like the paper's at its number of digits
+    config           equal, numbers to a part in 1e9
+    others           within the margin of the paper's, or the machine-readable check; equal words where the
+                     paper gives words; without either, the check in words, which is the notebook's test
+                     (scene: 'reported' needs only a finding)
+    """
+    if finding is None:
+        return NOT_RUN
+    if profile not in JUDGED:
+        return NO_VERDICT
+    if claim.kind == "hardware" and not finding.real_frames:
+        return SURROGATE
+    if finding.holds is not False and _criterion_met(claim, finding):
+        return REPRODUCED
+    return SAME_DIRECTION if finding.holds and claim.kind in ("measured", "hardware") else NOT_REPRODUCED
+
+
+def _criterion_met(claim: Claim, finding: Finding) -> bool:
+    """Whether the finding meets the one criterion of its claim; see verdict."""
+    ours, paper = numbers(finding.value), numbers(claim.paper)
+    if paper is None:
+        return finding.value == claim.paper and (finding.holds is True or not claim.judged_in_words)
+    papers = paper * len(ours) if len(paper) == 1 else paper
+    match claim.criterion:
+        case "digits":
+            return [f"{a:.{claim.digits}f}" for a in ours] == [f"{b:.{claim.digits}f}" for b in papers]
+        case "margin":
+            margins = claim.margin if isinstance(claim.margin, tuple) else (claim.margin,) * len(ours)
+            # the last term lets a distance that equals the margin in decimals be within it
+            return all(abs(a - b) <= m + 1e-9 for a, b, m in zip(ours, papers, margins, strict=True))
+        case "at_least":
+            return min(ours) >= claim.at_least
+        case "at_most":
+            return max(ours) <= claim.at_most
+        case "equal":
+            return all(a == claim.equal for a in ours)
+        case "between":
+            return claim.between[0] <= min(ours) and max(ours) <= claim.between[1]
+    if claim.kind == "config":
+        return all(map(math.isclose, ours, papers))
+    return finding.holds is True or claim.kind == "scene"
+
+
+class Findings:
+    """Collects the findings of one notebook and writes them to <outputs>/results/<notebook>.json.
+
+    notebook  its name, e.g. '04_pixels'
+    outputs   folder of the profile's outputs
+    profile   the profile that the numbers were made with; it is recorded with them
+
+    Raises UserError for an unknown notebook.
+    """
+
+    def __init__(self, notebook: str, outputs: Path, profile: str, claims: Mapping[str, Claim] | None = None):
+        if notebook not in Notebook.__args__:
+            raise UserError(f"unknown notebook {notebook!r}; there are {', '.join(Notebook.__args__)}")
+        everything = load_claims() if claims is None else claims
+        self.notebook, self.profile = notebook, profile
+        self.path = Path(outputs) / "results" / f"{notebook}.json"
+        self.claims = {name: claim for name, claim in everything.items() if claim.nb == notebook}
+        self.found: dict[str, Finding] = {}
+
+    def add(self, name: str, value: Any, *, seeds: Any = None, n: Any = None, **fields: Any) -> None:
+        """Adds the finding for the claim of this id; the other fields are those of Finding.
+
+        Numbers may be numpy's, lists numpy arrays. n is the number of seeds unless it is given.
+
+        Raises UserError, one line with the id, for an id that is not this notebook's or was added already, an
+        unknown field, a value that is not finite or not shaped like the paper's, an interval upside down, and
+        a missing holds where the check is only in words.
+        """
+        where = f"{self.notebook}: {name}"
+        if name not in self.claims:
+            raise UserError(f"{where} is not one of its claims; they are {', '.join(self.claims)}")
+        if name in self.found:
+            raise UserError(f"{where} was added already")
+        count = len(seeds) if n is None and seeds is not None else n
+        entry = {key: _plain(item) for key, item in dict(value=value, seeds=seeds, n=count, **fields).items()}
+        for key, item in entry.items():
+            if not all(math.isfinite(x) for x in np.ravel(item) if isinstance(x, float)):
+                raise UserError(f"{where}: {key} must be finite, got {item}")
+        finding = _parse(Finding, entry, where)
+        _check_shape(self.claims[name], finding, where)
+        self.found[name] = finding
+
+    def write(self, pending: Collection[str] = ()) -> Path:
+        """Writes the results file, whole or not at all, and returns its path.
+
+        pending  ids of sections that this notebook or this profile does not have; they read 'not run'
+
+        Raises UserError when an id of this notebook is neither there nor pending, or both, when a pending one
+        is not its own, and when the file cannot be written.
+        """
+        for name in pending:
+            if name not in self.claims or name in self.found:
+                reason = "was added" if name in self.found else "is not one of its claims"
+                raise UserError(f"{self.notebook}: {name} is given as pending but {reason}")
+        missing = [name for name in self.claims if name not in self.found and name not in pending]
+        if missing:
+            raise UserError(
+                f"{self.notebook}: no finding for {', '.join(missing)}; add it or call it pending"
+            )
+        entries = {
+            name: self.found[name].model_dump() | {"verdict": verdict(claim, self.found[name], self.profile)}
+            for name, claim in self.claims.items()
+            if name in self.found
+        }
+        head = {"notebook": self.notebook, "profile": self.profile, "pending": sorted(pending)}
+        text = json.dumps({**head, "findings": entries}, indent=1, ensure_ascii=False) + "\n"
+        writable_folder(self.path.parent)
+        write_atomically(self.path, text.encode())
+        return self.path
+
+
+def _plain(item: Any) -> Any:
+    """numpy's scalars and arrays as Python's, also inside a list."""
+    if isinstance(item, (list, tuple)):
+        return [_plain(part) for part in item]
+    return item.tolist() if hasattr(item, "tolist") else item
+
+
+def _check_shape(claim: Claim, finding: Finding, where: str) -> None:
+    """The value must be comparable with the paper's; words need a test where only a test can judge them."""
+    ours, paper = numbers(finding.value), numbers(claim.paper)
+    alike = isinstance(finding.value, str) if paper is None else ours and len(paper) in (1, len(ours))
+    if not alike:
+        raise UserError(
+            f"{where}: value {finding.value!r} is not comparable with the paper's {claim.paper!r}"
+        )
+    if claim.judged_in_words and finding.holds is None:
+        raise UserError(f"{where}: holds must be True or False, its check is only in words: {claim.check}")
+    if finding.low is None and finding.high is None:
+        return
+    if finding.low is None or finding.high is None:
+        raise UserError(f"{where}: low and high go together, got {finding.low} and {finding.high}")
+    lows, highs = numbers(finding.low), numbers(finding.high)
+    if not len(lows) == len(highs) == len(ours or ()) or any(map(operator.gt, lows, highs)):
+        raise UserError(
+            f"{where}: expected low <= high a number of the value, got {finding.low}, {finding.high}"
+        )

@@ -1,0 +1,264 @@
+"""The whole reproduction: executes the notebooks in order and says how each went.
+
+    python run_all.py [--profile full|quick|smoke] [--only NAME ...] [--workers N] [--outputs DIR] [--list]
+
+Exit status: 0 all well, 1 a notebook failed, 2 bad input (nothing was computed), 130 interrupted.
+"""
+
+import argparse
+import contextlib
+import csv
+import logging
+import os
+import sys
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+from lt_lib.files import writable_folder
+from lt_lib.manifest import write_manifest
+from lt_lib.params import ROOT, UserError, load_profile, notebook_defaults, notebook_names
+from lt_lib.progress import Progress, read_progress
+
+# Without these the later notebook can only fail too; the scoreboard joins whatever is there.
+NEEDS = {"04_pixels": ("02_encoder",), "07_corruption": ("04_pixels",)}
+# What this script gives to every notebook, over what the profile says.
+GIVEN = ("profile", "outputs", "workers")
+CELL_LIMIT_S = 6 * 3600
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to execute, checked: notebooks in order, the parameters of each, and where everything goes."""
+
+    root: Path
+    profile: str
+    outputs: Path
+    parameters: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a notebook went: 'ok', 'FAILED' or 'skipped', seconds, and the reason in one line."""
+
+    status: str
+    seconds: float
+    reason: str = ""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that leaves the printing of errors to us."""
+
+    def error(self, message: str) -> None:
+        raise UserError(message)
+
+
+def main(arguments: Sequence[str], root: Path = ROOT) -> int:
+    """Runs the command line for the project in `root`; returns the exit status."""
+    try:
+        options = parse(arguments)
+        if options.list:
+            print("\n".join(notebook_names(root)))
+            return 0
+        plan = make_plan(options, root)
+        preflight(plan)
+        outcomes = execute_all(plan)
+    except UserError as error:
+        print(f"run_all: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        logging.getLogger("asyncio").disabled = True  # papermill's abandoned cell would complain at exit
+        print("run_all: interrupted; finished runs are kept, the same command goes on from there", file=sys.stderr)
+        return 130
+    return 0 if all(outcome.status == "ok" for outcome in outcomes.values()) else 1
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = Parser(prog="run_all.py", description="Executes the notebooks in order and says how each went.")
+    parser.add_argument("--profile", default="full", help="a file of params/: full (default), quick or smoke")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)")
+    parser.add_argument("--outputs", type=Path, metavar="DIR", help="default: outputs/<profile>")
+    parser.add_argument("--list", action="store_true", help="name the notebooks and stop")
+    options = parser.parse_args(arguments)
+    if options.workers < 0:
+        raise UserError(f"argument --workers: expected 0 or more, got {options.workers}")
+    return options
+
+
+def make_plan(options: argparse.Namespace, root: Path) -> Plan:
+    """Raises UserError for anything unknown or mistyped in the options, the profile or the notebooks."""
+    profile = load_profile(options.profile, root)
+    chosen = choose(options.only, list(profile)) if options.only else list(profile)
+    # The default stays empty, so that executed notebooks do not depend on where the project lies.
+    outputs = str(options.outputs.resolve()) if options.outputs else ""
+    given = dict(zip(GIVEN, (options.profile, outputs, options.workers), strict=True))
+    return Plan(
+        root=root,
+        profile=options.profile,
+        outputs=Path(outputs or root / "outputs" / options.profile),
+        parameters={name: profile[name] | given for name in chosen},
+    )
+
+
+def choose(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
+    """The notebooks meant by names such as '04_pixels', '04', '4' or 'pixels', in numeric order."""
+    meant = {name: {name, name[:2], str(int(name[:2])), name[3:]} for name in names}
+    for word in wanted:
+        if not any(word in aliases for aliases in meant.values()):
+            raise UserError(f"argument --only: unknown notebook {word!r}; there are {', '.join(names)}")
+    return [name for name in names if meant[name] & set(wanted)]
+
+
+def preflight(plan: Plan) -> None:
+    """Everything that can be known to be wrong before computing. Raises UserError."""
+    for name in plan.parameters:
+        missing = set(GIVEN) - set(notebook_defaults(plan.root / "notebooks" / f"{name}.ipynb"))
+        if missing:
+            raise UserError(f"{name}.ipynb: its parameters cell must declare {', '.join(sorted(missing))}")
+    for folder in (plan.outputs, plan.root / "outputs" / "runs"):
+        writable_folder(folder)
+
+
+def execute_all(plan: Plan) -> dict[str, Outcome]:
+    """Executes every notebook whose needs did not fail, prints a line each, and writes the manifest."""
+    outcomes: dict[str, Outcome] = {}
+    for name in plan.parameters:
+        failed = [need for need in NEEDS.get(name, ()) if need in outcomes and outcomes[need].status != "ok"]
+        outcomes[name] = Outcome("skipped", 0.0, f"needs {failed[0]}") if failed else execute(plan, name)
+        outcome = outcomes[name]
+        print(f"{name:20}{outcome.status:8}{clock(outcome.seconds):>8}  {outcome.reason}".rstrip(), flush=True)
+    entries = {name: {"status": each.status, "seconds": round(each.seconds, 1)} for name, each in outcomes.items()}
+    write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, entries)
+    if "09_scoreboard" in outcomes and outcomes["09_scoreboard"].status == "ok":
+        print_summary(plan.outputs / "scoreboard.csv")
+    return outcomes
+
+
+def execute(plan: Plan, name: str) -> Outcome:
+    """Executes one notebook. It went well if no cell raised and it wrote its results anew."""
+    log = plan.outputs / "logs" / f"{name}.log"
+    results = plan.outputs / "results" / f"{name}.json"
+    before = results.stat().st_mtime_ns if results.exists() else None
+    started = time.time()
+    log.parent.mkdir(exist_ok=True)
+    with log.open("w", encoding="utf-8") as file, live_line(name, plan.root / "outputs" / "runs"):
+        reason = run_papermill(plan, name, file)
+    if not reason and (not results.exists() or results.stat().st_mtime_ns == before):
+        reason = f"it ended without writing {shown(results, plan.root)}"
+    if reason:
+        reason = f"{reason} (log: {shown(log, plan.root)})"
+    return Outcome("FAILED" if reason else "ok", time.time() - started, reason)
+
+
+def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
+    """Executes a notebook into <outputs>/notebooks, its output into a log too; returns what went wrong, if anything."""
+    import papermill  # takes seconds, which bad input need not wait for
+
+    executed = plan.outputs / "notebooks" / f"{name}.ipynb"
+    executed.parent.mkdir(exist_ok=True)
+    try:
+        # Relative paths, since papermill writes them into the executed notebook.
+        with contextlib.chdir(plan.root), stderr_into(log):
+            papermill.execute_notebook(
+                f"notebooks/{name}.ipynb",
+                shown(executed, plan.root),
+                dict(plan.parameters[name]),
+                kernel_name="python3",
+                language="python",
+                progress_bar=False,
+                stdout_file=log,
+                stderr_file=log,
+                execution_timeout=CELL_LIMIT_S,
+                extra_arguments=["--log-level=ERROR"],  # kernels warn of a local TCP port
+            )
+    except papermill.PapermillExecutionError as error:
+        log.write(str(error))
+        return f"cell {error.cell_index}: {error.ename}: {first_line(error.evalue)}"
+    except (RuntimeError, OSError, ValueError) as error:  # a dead kernel, a cell over its time, a full disk
+        log.write(traceback.format_exc())
+        return f"{type(error).__name__}: {first_line(str(error))}"
+    return ""
+
+
+@contextlib.contextmanager
+def stderr_into(file: TextIO) -> Iterator[None]:
+    """Sends what this process and those that it starts say on stderr into a file."""
+    kept = os.dup(2)
+    os.dup2(file.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+@contextlib.contextmanager
+def live_line(name: str, runs: Path) -> Iterator[None]:
+    """While the block runs, tells how far its runs are: one line that changes on a terminal, else now and then a line."""
+    done = threading.Event()
+    tell = tell_terminal if sys.stdout.isatty() else tell_file
+    thread = threading.Thread(target=tell, args=(name, runs, done), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def tell_terminal(name: str, runs: Path, done: threading.Event) -> None:
+    started = time.time()
+    while not done.wait(0.5):
+        line = describe(read_progress(runs, since=started), time.time() - started)
+        print(f"\r{name:20}{line}\x1b[K", end="", flush=True)
+    print("\r\x1b[K", end="", flush=True)
+
+
+def tell_file(name: str, runs: Path, done: threading.Event) -> None:
+    """One line when a stage begins and one a minute after that."""
+    started = time.time()
+    told, due = "", 0.0
+    while not done.wait(0.5):
+        progress = read_progress(runs, since=started)
+        if progress and (progress.what != told or time.time() > due):
+            told, due = progress.what, time.time() + 60
+            print(f"{name:20}{describe(progress, time.time() - started)}", flush=True)
+
+
+def describe(progress: Progress | None, seconds: float) -> str:
+    """For instance '12:01  route heads 12/35 (34%), about 2:10 left'."""
+    if progress is None:
+        return clock(seconds)
+    left = "" if progress.left is None else f", about {clock(progress.left)} left"
+    return f"{clock(seconds)}  {progress.what} {progress.done}/{progress.total} ({progress.fraction:.0%}){left}"
+
+
+def clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
+
+
+def shown(path: Path, root: Path) -> str:
+    """A path as seen from the project's root, if it lies in there."""
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
+
+
+def first_line(text: str) -> str:
+    return (text.strip().splitlines() or [""])[0]
+
+
+def print_summary(scoreboard: Path) -> None:
+    """How many claims got which verdict, e.g. 'scoreboard: 41 reproduced, 3 same direction'."""
+    with scoreboard.open(encoding="utf-8", newline="") as file:
+        verdicts = Counter(row["verdict"] for row in csv.DictReader(file))
+    print("scoreboard: " + ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common()))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

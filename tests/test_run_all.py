@@ -1,0 +1,324 @@
+"""run_all.py from its command line, on a small project of its own: bad input, failures, progress, kill and resume."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+import psutil
+import pytest
+from pydantic import TypeAdapter, ValidationError
+from toy_runs import ToyConfig, train_toy
+
+from lt_lib import params
+from lt_lib.params import ROOT, UserError, explain, load_profile
+from run_all import choose, clock, main
+
+PARAMETERS = """profile = "smoke"
+outputs = ""
+workers = 0
+seeds = 2
+share = 0.5
+content = "latent"
+sizes = [1, 2]
+toy = {}"""
+
+COMPUTE = """import json
+from pathlib import Path
+from toy_runs import ToyConfig, train_toy
+from lt_lib.runs import Run, RunStore
+store = RunStore(Path("outputs/runs"), workers)
+results = store.fetch([Run(train_toy, ToyConfig(**toy), seed) for seed in range(seeds)], "toys")"""
+
+WRITE = """path = Path(outputs or f"outputs/{profile}") / "results" / "NAME.json"
+path.parent.mkdir(exist_ok=True)
+path.write_text(json.dumps([result["loss"] for result in results]))"""
+
+RAISE = 'raise ValueError("the gate\\nfailed")'
+
+
+def write_notebook(root: Path, name: str, *cells: str, parameters: str = PARAMETERS) -> None:
+    first = nbformat.v4.new_code_cell(parameters, metadata={"tags": ["parameters"]})
+    rest = [nbformat.v4.new_code_cell(cell.replace("NAME", name)) for cell in cells]
+    kernel = {"name": "python3", "display_name": "Python 3"}
+    notebook = nbformat.v4.new_notebook(cells=[first, *rest], metadata={"kernelspec": kernel})
+    nbformat.write(notebook, root / "notebooks" / f"{name}.ipynb")
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A project's root with two notebooks that compute; its notebooks find our modules, and its params theirs."""
+    root = tmp_path / "project"
+    for folder in ("notebooks", "params"):
+        (root / folder).mkdir(parents=True)
+    for name in ("02_encoder", "03_gridworld"):
+        write_notebook(root, name, COMPUTE, WRITE)
+    (root / "params" / "smoke.yaml").write_text("shared: {seeds: 2}\n02_encoder: {toy: {size: 5}}\n")
+    (root / "params" / "claims.yaml").write_text("")
+    (root / "requirements.txt").write_text("numpy==2\n")
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{ROOT / 'tests'}")
+    monkeypatch.setitem(params.SECTIONS, "toy", ToyConfig)
+    return root
+
+
+def smoke(root: Path, *arguments: str) -> int:
+    return main(["--profile", "smoke", "--workers", "1", *arguments], root)
+
+
+def losses(root: Path, name: str) -> list[float]:
+    return json.loads((root / "outputs" / "smoke" / "results" / f"{name}.json").read_text())
+
+
+# --- bad input
+
+
+@pytest.mark.parametrize(
+    ("yaml", "complaint"),
+    [
+        ("04_pixel: {}", "smoke.yaml: unknown notebook '04_pixel'; there are 02_encoder, 03_gridworld"),
+        ("shared: {seed: 2}", "smoke.yaml: shared: no notebook declares 'seed'; there are content, "),
+        ("02_encoder: {seed: 2}", "smoke.yaml: 02_encoder: unknown parameter 'seed'; there are content, "),
+        ("02_encoder: {seeds: '2'}", "smoke.yaml: 02_encoder: seeds: expected int such as 2, got '2'"),
+        ("02_encoder: {seeds: true}", "smoke.yaml: 02_encoder: seeds: expected int such as 2, got True"),
+        ("02_encoder: {seeds: 2.0}", "smoke.yaml: 02_encoder: seeds: expected int such as 2, got 2.0"),
+        ("shared: {share: 3e-4}", "smoke.yaml: 02_encoder: share: expected float such as 0.5, got '3e-4'"),
+        ("02_encoder: {content: 3}", "smoke.yaml: 02_encoder: content: expected str such as 'latent', got 3"),
+        ("02_encoder: {sizes: [1, a]}", "smoke.yaml: 02_encoder: sizes: expected list such as [1, 2], got [1, 'a']"),
+        ("02_encoder: {toy: {size: 0}}", "smoke.yaml: 02_encoder: toy.size: must be greater than 0, got 0"),
+        ("02_encoder: {toy: {sizes: 1}}", "smoke.yaml: 02_encoder: toy.sizes: unknown parameter; toy has fails, seconds, size"),
+        ("02_encoder: {toy: {size: '4'}}", "smoke.yaml: 02_encoder: toy.size: must be a valid integer, got '4'"),
+        ("02_encoder: 3", "smoke.yaml: 02_encoder: expected parameters "),
+        ("- 3", "smoke.yaml: expected sections such as 'shared:', got [3]"),
+        ("02_encoder: {toy: [", "smoke.yaml: not valid yaml: "),
+        ("02_encoder: {}\n02_encoder: {seeds: 3}", "smoke.yaml: not valid yaml: '02_encoder' is given twice"),
+    ],
+)
+def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml, complaint):
+    (project / "params" / "smoke.yaml").write_text(yaml)
+    assert_refused(project, capfd, ["--profile", "smoke"], complaint)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--profile", "tiny"], "unknown profile 'tiny'; there are smoke"),
+        (["--profile", "claims"], "unknown profile 'claims'; there are smoke"),
+        (["--profile", "../params/smoke"], "unknown profile '../params/smoke'; there are smoke"),
+        (["--profile", "smoke", "--only", "pixels"], "argument --only: unknown notebook 'pixels'; there are 02_encoder"),
+        (["--profile", "smoke", "--workers", "-1"], "argument --workers: expected 0 or more, got -1"),
+        (["--profile", "smoke", "--workers", "two"], "argument --workers: invalid int value: 'two'"),
+        (["--profile", "smoke", "--fast"], "unrecognized arguments: --fast"),
+        (["--profile", "smoke", "--outputs", "requirements.txt/out"], "cannot write in the folder "),
+    ],
+)
+def test_a_bad_option_is_one_line_and_nothing_is_computed(project, capfd, monkeypatch, arguments, complaint):
+    monkeypatch.chdir(project)
+    assert_refused(project, capfd, arguments, complaint)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "complaint"),
+    [
+        ("seeds = 2\ntoy = {}", "02_encoder.ipynb: its parameters cell must declare outputs, profile, workers"),
+        ("seeds = 1 + 1", "02_encoder.ipynb: the parameters cell may hold only lines such as name = literal"),
+        ("import os", "02_encoder.ipynb: the parameters cell may hold only lines such as name = literal"),
+    ],
+)
+def test_a_bad_parameters_cell_is_one_line(project, capfd, parameters, complaint):
+    write_notebook(project, "02_encoder", COMPUTE, WRITE, parameters=parameters)
+    assert_refused(project, capfd, ["--profile", "smoke"], complaint)
+
+
+def test_a_notebook_without_a_parameters_cell_is_one_line(project, capfd):
+    nbformat.write(nbformat.v4.new_notebook(), project / "notebooks" / "02_encoder.ipynb")
+    complaint = "02_encoder.ipynb: expected exactly one cell tagged 'parameters', found 0"
+    assert_refused(project, capfd, ["--profile", "smoke"], complaint)
+
+
+def assert_refused(root: Path, capfd, arguments: list[str], complaint: str) -> None:
+    results = root / "outputs" / "smoke" / "results" / "02_encoder.json"
+    results.parent.mkdir(parents=True)
+    results.write_text("earlier")
+    before = sorted(root.rglob("*"))
+    assert main(arguments, root) == 2
+    out, err = capfd.readouterr()
+    assert err.startswith(f"run_all: {complaint}")
+    assert (out, err.count("\n")) == ("", 1)
+    assert sorted(root.rglob("*")) == before
+    assert results.read_text() == "earlier"
+
+
+def test_a_profile_gives_shared_values_where_declared_and_the_notebooks_own_over_them(project):
+    write_notebook(project, "04_pixels", parameters="share = 0.5\nother = 1")
+    (project / "params" / "smoke.yaml").write_text("shared: {seeds: 3, share: 1}\n03_gridworld: {seeds: 4}\n")
+    assert load_profile("smoke", project) == {
+        "02_encoder": {"seeds": 3, "share": 1},
+        "03_gridworld": {"seeds": 4, "share": 1},
+        "04_pixels": {"share": 1},
+    }
+
+
+def test_a_dict_without_settings_is_refused(project, monkeypatch):
+    monkeypatch.delitem(params.SECTIONS, "toy")
+    with pytest.raises(UserError, match="02_encoder: toy: SECTIONS has no settings for it"):
+        load_profile("smoke", project)
+
+
+def test_settings_are_strict_frozen_and_take_lists_for_tuples():
+    class Nested(params.Settings):
+        corners: tuple[tuple[float, float], ...] = ()
+
+    config = Nested(corners=[[0, 1], [2, 3.5]])
+    assert config.corners == ((0, 1), (2, 3.5))
+    assert hash(config) == hash(Nested(corners=((0, 1), (2, 3.5))))
+    for bad in ({"corners": [["0", 1]]}, {"corners": [[float("nan"), 1]]}, {"corner": []}):
+        with pytest.raises(ValidationError):
+            Nested(**bad)
+    with pytest.raises(ValidationError):
+        config.corners = ()
+
+
+def test_the_error_of_a_deep_setting_names_its_place():
+    with pytest.raises(ValidationError) as caught:
+        TypeAdapter(dict[str, list[int]]).validate_python({"a": [1, "2"]}, strict=True)
+    assert explain(caught.value, "toy", dict) == "toy.a.1: must be a valid integer, got '2'"
+
+
+# --- executing
+
+
+def test_only_takes_numbers_and_names():
+    names = ["02_encoder", "04_pixels", "07_corruption"]
+    assert choose(["corruption", "2"], names) == ["02_encoder", "07_corruption"]
+    assert choose(["04_pixels", "04"], names) == ["04_pixels"]
+
+
+def test_list_names_the_notebooks(project, capfd):
+    assert main(["--list"], project) == 0
+    assert capfd.readouterr().out == "02_encoder\n03_gridworld\n"
+
+
+@pytest.mark.parametrize(("seconds", "shown"), [(5.4, "0:05"), (125, "2:05"), (3725, "1:02:05")])
+def test_clock(seconds, shown):
+    assert clock(seconds) == shown
+
+
+def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd):
+    assert smoke(project) == 0
+    outputs = project / "outputs" / "smoke"
+    manifest = json.loads((outputs / "manifest.json").read_text())
+    for name in ("02_encoder", "03_gridworld"):
+        assert len(losses(project, name)) == 2
+        assert (outputs / "logs" / f"{name}.log").exists()
+        assert str(project) not in (outputs / "notebooks" / f"{name}.ipynb").read_text()
+        assert manifest["notebooks"][name]["status"] == "ok"
+        assert manifest["notebooks"][name]["seconds"] > 0
+    assert manifest["profile"] == "smoke"
+    assert set(manifest["versions"]) == {"python", "numpy"}
+    assert manifest["machine"]["cores"] >= 1
+    out = capfd.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in out if "toys" not in line][:2] == [["02_encoder", "ok"], ["03_gridworld", "ok"]]
+
+
+def test_a_scoreboard_is_summed_up_in_the_last_line(project, capfd):
+    table = 'Path("outputs/smoke/scoreboard.csv").write_text("id,verdict\\na,reproduced\\nb,not run\\nc,reproduced")'
+    write_notebook(project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, WRITE)
+    assert smoke(project, "--only", "09") == 0
+    assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: 2 reproduced, 1 not run"
+
+
+def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(project, capfd):
+    for name, cells in {"02_encoder": [COMPUTE, RAISE], "04_pixels": [COMPUTE, WRITE], "07_corruption": []}.items():
+        write_notebook(project, name, *cells)
+    write_notebook(project, "03_gridworld", COMPUTE, "raise SystemExit(0)", WRITE)
+    write_notebook(project, "08_hardware_decode", "results = [{'loss': 1}]\nimport json\nfrom pathlib import Path", WRITE)
+    stale = project / "outputs" / "smoke" / "results" / "03_gridworld.json"
+    stale.parent.mkdir(parents=True)
+    stale.write_text("[]")
+    assert smoke(project) == 1
+    lines = {line.split()[0]: line for line in capfd.readouterr().out.splitlines() if "toys" not in line}
+    assert "FAILED" in lines["02_encoder"]
+    assert lines["02_encoder"].endswith("cell 3: ValueError: the gate (log: outputs/smoke/logs/02_encoder.log)")
+    assert "ValueError: the gate" in (project / "outputs" / "smoke" / "logs" / "02_encoder.log").read_text()
+    assert "ended without writing outputs/smoke/results/03_gridworld.json" in lines["03_gridworld"]
+    assert "skipped" in lines["04_pixels"]
+    assert lines["04_pixels"].endswith("needs 02_encoder")
+    assert lines["07_corruption"].endswith("needs 04_pixels")
+    assert "ok" in lines["08_hardware_decode"]
+    assert losses(project, "08_hardware_decode") == [1]
+
+
+def test_a_lost_kernel_is_a_failed_notebook(project, capfd):
+    write_notebook(project, "02_encoder", "import os\nos._exit(9)", WRITE)
+    assert smoke(project, "--only", "encoder") == 1
+    assert "FAILED" in capfd.readouterr().out
+
+
+def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_writes_where_told(project, tmp_path):
+    for only in ("02", "gridworld"):
+        assert smoke(project, "--only", only, "--outputs", str(tmp_path / "elsewhere")) == 0
+    manifest = json.loads((tmp_path / "elsewhere" / "manifest.json").read_text())
+    assert list(manifest["notebooks"]) == ["02_encoder", "03_gridworld"]
+    assert not (project / "outputs" / "smoke").exists()
+
+
+# --- killing
+
+START = "import sys, pathlib, run_all; sys.exit(run_all.main(sys.argv[2:], pathlib.Path(sys.argv[1])))"
+
+
+def start(root: Path) -> subprocess.Popen:
+    """run_all in a process of its own, on notebook 02 with runs of one second, one at a time."""
+    # The process has no settings for 'toy', so the notebook has it by default.
+    parameters = PARAMETERS.replace("toy = {}", "toy = {'seconds': 1.0}").replace("seeds = 2", "seeds = 3")
+    write_notebook(root, "02_encoder", COMPUTE, WRITE, parameters=parameters)
+    (root / "params" / "smoke.yaml").write_text("")
+    command = [sys.executable, "-c", START, str(root), "--profile", "smoke", "--only", "02", "--workers", "1"]
+    return subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def journal(root: Path) -> list[dict]:
+    path = root / "outputs" / "runs" / "journal.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def wait_until(condition, seconds: float) -> None:
+    limit = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < limit, "waited in vain"
+        time.sleep(0.05)
+
+
+def end_in_the_middle(root: Path, how: signal.Signals) -> subprocess.Popen:
+    """Sends a signal once one run is kept and another in flight; returns when kernel and workers are gone."""
+    process = start(root)
+    wait_until(lambda: len(journal(root)) == 1, seconds=60)
+    below = psutil.Process(process.pid).children(recursive=True)
+    assert len(below) >= 2, "expected a kernel and a worker"
+    process.send_signal(how)
+    process.wait(timeout=20)
+    _, alive = psutil.wait_procs(below, timeout=10)
+    assert not alive
+    return process
+
+
+def test_killed_in_the_middle_it_goes_on_without_repeating_a_finished_run(project):
+    assert end_in_the_middle(project, signal.SIGKILL).returncode == -signal.SIGKILL
+    kept = len(journal(project))
+    assert kept < 3
+    assert start(project).wait(timeout=60) == 0
+    assert len(journal(project)) == 3
+    assert sorted(line["seed"] for line in journal(project)) == [0, 1, 2]
+    undisturbed = [train_toy(ToyConfig(), seed, report=lambda fraction: None)["loss"] for seed in range(3)]
+    assert losses(project, "02_encoder") == undisturbed
+
+
+def test_interrupted_it_says_so_and_leaves_nothing_running(project):
+    process = end_in_the_middle(project, signal.SIGINT)
+    assert process.returncode == 130
+    (line,) = process.stderr.read().splitlines()
+    assert line.startswith("run_all: interrupted; finished runs are kept")

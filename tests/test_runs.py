@@ -1,0 +1,257 @@
+"""The run store: keys, checked files, workers, failures and progress."""
+
+import json
+import logging
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_runs import ToyConfig, count_threads, lose_worker, train_toy
+
+from lt_lib.params import UserError
+from lt_lib.progress import Reporter, read_progress, stage
+from lt_lib.runs import Run, RunError, RunStore, pack, unpack
+from lt_lib.sources import source_digest
+
+SLOW = ToyConfig(seconds=0.3)
+
+
+def toys(count, config=SLOW):
+    return [Run(train_toy, config, seed) for seed in range(count)]
+
+
+def journal_keys(folder: Path) -> list[str]:
+    return [json.loads(line)["key"] for line in (folder / "journal.jsonl").read_text().splitlines()]
+
+
+def kept_files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*/*.run")}
+
+
+@pytest.fixture
+def finished(tmp_path):
+    """A store with one finished run, and its file."""
+    store = RunStore(tmp_path, workers=1)
+    (result,) = store.fetch(toys(1), "toys")
+    (path,) = tmp_path.glob("train_toy/*.run")
+    return store, result, path
+
+
+# --- results
+
+
+def test_packing_gives_back_every_kind_of_value_and_equal_bytes_for_equal_results():
+    result = {
+        "flags": np.array([True, False]),
+        "frames": np.arange(24, dtype=np.uint8).reshape(2, 3, 4).transpose(2, 0, 1),
+        "scalar_array": np.array(1.5),
+        "empty": np.zeros((0, 3), np.float32),
+        "loss": 0.1,
+        "steps": np.int64(3),
+        "text": "left",
+        "curve": [1.0, float("inf")],
+        "nothing": None,
+    }
+    packed = pack(result)
+    back = unpack(packed)
+    assert set(back) == set(result)
+    for name, value in result.items():
+        np.testing.assert_array_equal(back[name], value)
+        assert getattr(back[name], "dtype", None) == getattr(value, "dtype", None) or name == "steps"
+    assert pack(dict(reversed(result.items()))) == packed
+
+
+@pytest.mark.parametrize("value", [np.array(["left"]), {"a": object()}])
+def test_a_result_that_cannot_be_kept_is_named(value):
+    with pytest.raises(TypeError, match="route"):
+        pack({"route": value})
+
+
+# --- keys
+
+
+def test_key_follows_function_config_seed_and_the_contents_of_inputs():
+    start = {"weights": np.zeros((4, 3))}
+    runs = [
+        Run(train_toy, ToyConfig(), 0),
+        Run(train_toy, ToyConfig(), 1),
+        Run(train_toy, ToyConfig(size=5), 0),
+        Run(count_threads, ToyConfig(), 0),
+        Run(train_toy, ToyConfig(), 0, {"start": start}),
+        Run(train_toy, ToyConfig(), 0, {"start": {"weights": np.ones((4, 3))}}),
+    ]
+    assert len({run.key() for run in runs}) == len(runs)
+    assert Run(train_toy, ToyConfig(size=4), 0, {"start": {"weights": np.zeros((4, 3))}}).key() == runs[4].key()
+
+
+@pytest.mark.parametrize("library", ["torch", "numpy", "mujoco"])
+def test_key_follows_library_versions(library, monkeypatch):
+    before = toys(1)[0].key()
+    monkeypatch.setattr("lt_lib.runs.library_versions", lambda: {library: "0.1"})
+    assert toys(1)[0].key() != before
+
+
+def test_a_function_that_workers_cannot_import_is_refused():
+    with pytest.raises(ValueError, match="local_train"):
+
+        def local_train(config, seed, *, report):
+            return {}
+
+        Run(local_train, ToyConfig(), 0)
+
+
+LAB = {
+    "lab/__init__.py": "",
+    "lab/train.py": '"""Doc."""\nfrom lab.deep import layer\nfrom lt_lib.params import TrainConfig\ndef train(): pass\n',
+    "lab/deep/__init__.py": "WIDTH = 3\n",
+    "lab/deep/layer.py": "def layer():\n    from .. import lazy\n    return 1\n",
+    "lab/lazy.py": "import numpy\n",
+    "lab/unrelated.py": "from lab import train\n",
+    "lt_lib/__init__.py": "",
+    "lt_lib/params.py": "class Base: pass\nclass TrainConfig(Base): size = 1\nclass OtherConfig(Base): size = 1\n",
+}
+
+
+@pytest.fixture
+def lab_digest(tmp_path):
+    """The digest of lab.train.train after an edit: lab_digest(file, old, new)."""
+
+    def train():
+        pass
+
+    train.__module__ = "lab.train"
+
+    def digest(file="lab/train.py", old="", new=""):
+        for name, text in LAB.items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text.replace(old, new, 1) if name == file else text)
+        return source_digest(train, folder=tmp_path)
+
+    return digest
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("lab/train.py", "pass", "return 2"),
+        ("lab/deep/__init__.py", "3", "4"),
+        ("lab/deep/layer.py", "return 1", "return 2"),
+        ("lab/lazy.py", "numpy", "scipy"),
+        ("lt_lib/params.py", "TrainConfig(Base): size = 1", "TrainConfig(Base): size = 2"),
+        ("lt_lib/params.py", "Base: pass", "Base: size = 2"),
+    ],
+)
+def test_digest_changes_with_code_that_is_imported(lab_digest, file, old, new):
+    assert lab_digest(file, old, new) != lab_digest()
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("lab/unrelated.py", "train", "deep"),
+        ("lab/train.py", "Doc.", "Another docstring."),
+        ("lab/train.py", "def train(): pass", "# why\ndef train():\n    pass"),
+        ("lt_lib/params.py", "OtherConfig(Base): size = 1", "OtherConfig(Base): size = 2"),
+    ],
+)
+def test_digest_stays_with_unrelated_code_comments_and_docstrings(lab_digest, file, old, new):
+    assert lab_digest(file, old, new) == lab_digest()
+
+
+# --- fetching
+
+
+def test_results_come_in_order_and_finished_runs_are_not_repeated(tmp_path):
+    store = RunStore(tmp_path, workers=2)
+    first = store.fetch(toys(2), "toys")
+    again = store.fetch([*reversed(toys(3)), toys(1)[0]], "toys")
+    for result, seed in [*zip(first, (0, 1), strict=True), *zip(again, (2, 1, 0, 0), strict=True)]:
+        np.testing.assert_array_equal(result["weights"], np.random.default_rng(seed).normal(size=(4, 3)))
+    assert sorted(journal_keys(tmp_path)) == sorted(run.key() for run in toys(3))
+    assert not list(tmp_path.glob("inflight/*"))
+
+
+def test_result_files_are_the_same_bytes_for_one_worker_and_two(tmp_path):
+    for workers in (1, 2):
+        start = RunStore(tmp_path / str(workers), workers).fetch(toys(2), "toys")
+        runs = [Run(train_toy, ToyConfig(), seed, {"start": start[seed]}) for seed in range(2)]
+        RunStore(tmp_path / str(workers), workers).fetch(runs, "more toys")
+    files = kept_files(tmp_path / "1")
+    assert len(files) == 4
+    assert files == kept_files(tmp_path / "2")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_worker_has_one_thread(tmp_path, workers):
+    (threads,) = RunStore(tmp_path, workers).fetch([Run(count_threads, ToyConfig(), 0)], "threads")
+    assert threads == {"torch": 1, "numba": 1}
+
+
+@pytest.mark.parametrize("damage", [lambda old: old[:-20], lambda old: old[:-1] + bytes([old[-1] ^ 1]), lambda old: b""])
+def test_a_damaged_file_is_named_and_computed_again(finished, caplog, damage):
+    store, result, path = finished
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    with caplog.at_level(logging.WARNING):
+        (again,) = store.fetch(toys(1), "toys")
+    (record,) = caplog.records
+    assert str(path) in record.getMessage()
+    assert "\n" not in record.getMessage()
+    assert path.read_bytes() == whole
+    np.testing.assert_array_equal(again["weights"], result["weights"])
+    assert len(journal_keys(store.folder)) == 2
+
+
+def test_a_failing_run_is_named_and_the_others_are_kept(tmp_path):
+    bad = Run(train_toy, ToyConfig(size=2, fails=True), 7)
+    with pytest.raises(RunError, match=r"1 of 3 .*train_toy\(seed=7, size=2, fails=True\): ValueError: this seed"):
+        RunStore(tmp_path, workers=1).fetch([bad, *toys(2)], "toys")
+    assert sorted(journal_keys(tmp_path)) == sorted(run.key() for run in toys(2))
+
+
+def test_a_lost_worker_is_reported(tmp_path):
+    with pytest.raises(RunError, match=r"lose_worker\(seed=0\): TerminatedWorkerError"):
+        RunStore(tmp_path, workers=1).fetch([Run(lose_worker, ToyConfig(), 0)], "toys")
+
+
+def test_an_unwritable_folder_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=f"^cannot write in the folder {tmp_path}/file/runs: .*$"):
+        RunStore(tmp_path / "file" / "runs").fetch(toys(1), "toys")
+
+
+# --- progress
+
+
+def test_progress_counts_finished_runs_and_parts_of_those_in_flight(tmp_path):
+    since = time.time()
+    with stage(tmp_path, "toys", total=4) as (folder, finished):
+        Reporter(folder / "one.json")(0.9)
+        finished("one")
+        Reporter(folder / "two.json")(0.5)
+        time.sleep(0.2)
+        progress = read_progress(tmp_path, since)
+        assert (progress.what, progress.done, progress.total) == ("toys", 1, 4)
+        assert progress.fraction == pytest.approx(1.5 / 4)
+        assert progress.left == pytest.approx(progress.seconds * 2.5 / 1.5)
+        assert read_progress(tmp_path, since=time.time()) is None
+    assert read_progress(tmp_path, since) is None
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path):
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    left = tmp_path / "inflight" / str(process.pid)
+    left.mkdir(parents=True)
+    with stage(tmp_path, "toys", total=1) as (folder, _):
+        assert list(tmp_path.glob("inflight/*")) == [folder]
+
+
+def test_a_reporter_writes_at_most_twice_a_second(tmp_path):
+    report = Reporter(tmp_path / "run.json")
+    for fraction in (0.1, 0.2, 0.3):
+        report(fraction)
+    assert json.loads((tmp_path / "run.json").read_text()) == {"fraction": 0.1}
