@@ -73,7 +73,10 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
         return 2
     except KeyboardInterrupt:
         logging.getLogger("asyncio").disabled = True  # papermill's abandoned cell would complain at exit
-        print("run_all: interrupted; finished runs are kept, the same command goes on from there", file=sys.stderr)
+        print(
+            "run_all: interrupted; finished runs are kept, the same command goes on from there",
+            file=sys.stderr,
+        )
         return 130
     return 0 if all(outcome.status == "ok" for outcome in outcomes.values()) else 1
 
@@ -81,8 +84,12 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="run_all.py", description="Executes the notebooks in order and says how each went.")
     parser.add_argument("--profile", default="full", help="a file of params/: full (default), quick or smoke")
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels")
-    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)"
+    )
     parser.add_argument("--outputs", type=Path, metavar="DIR", help="default: outputs/<profile>")
     parser.add_argument("--list", action="store_true", help="name the notebooks and stop")
     options = parser.parse_args(arguments)
@@ -132,8 +139,12 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
         failed = [need for need in NEEDS.get(name, ()) if need in outcomes and outcomes[need].status != "ok"]
         outcomes[name] = Outcome("skipped", 0.0, f"needs {failed[0]}") if failed else execute(plan, name)
         outcome = outcomes[name]
-        print(f"{name:20}{outcome.status:8}{clock(outcome.seconds):>8}  {outcome.reason}".rstrip(), flush=True)
-    entries = {name: {"status": each.status, "seconds": round(each.seconds, 1)} for name, each in outcomes.items()}
+        print(
+            f"{name:20}{outcome.status:8}{clock(outcome.seconds):>8}  {outcome.reason}".rstrip(), flush=True
+        )
+    entries = {
+        name: {"status": each.status, "seconds": round(each.seconds, 1)} for name, each in outcomes.items()
+    }
     write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, entries)
     if "09_scoreboard" in outcomes and outcomes["09_scoreboard"].status == "ok":
         print_summary(plan.outputs / "scoreboard.csv")
@@ -157,7 +168,7 @@ def execute(plan: Plan, name: str) -> Outcome:
 
 
 def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
-    """Executes a notebook into <outputs>/notebooks, its output into a log too; returns what went wrong, if anything."""
+    """Executes a notebook into <outputs>/notebooks, its output into a log; returns what went wrong, or ''."""
     import papermill  # takes seconds, which bad input need not wait for
 
     executed = plan.outputs / "notebooks" / f"{name}.ipynb"
@@ -200,7 +211,7 @@ def stderr_into(file: TextIO) -> Iterator[None]:
 
 @contextlib.contextmanager
 def live_line(name: str, runs: Path) -> Iterator[None]:
-    """While the block runs, tells how far its runs are: one line that changes on a terminal, else now and then a line."""
+    """While the block runs, tells how far its runs are: in one live line on a terminal, else in several."""
     done = threading.Event()
     tell = tell_terminal if sys.stdout.isatty() else tell_file
     thread = threading.Thread(target=tell, args=(name, runs, done), daemon=True)
@@ -236,7 +247,9 @@ def describe(progress: Progress | None, seconds: float) -> str:
     if progress is None:
         return clock(seconds)
     left = "" if progress.left is None else f", about {clock(progress.left)} left"
-    return f"{clock(seconds)}  {progress.what} {progress.done}/{progress.total} ({progress.fraction:.0%}){left}"
+    return (
+        f"{clock(seconds)}  {progress.what} {progress.done}/{progress.total} ({progress.fraction:.0%}){left}"
+    )
 
 
 def clock(seconds: float) -> str:

@@ -1,1 +1,1 @@
-"""The library under the notebooks: scene and camera, encoder and messages, learners, statistics and figures."""
+"""The library under the notebooks: scene, camera, encoder, messages, learners, statistics and figures."""

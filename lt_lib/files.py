@@ -4,7 +4,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from lt_lib.params import UserError
+from lt_lib.params import ROOT, UserError
 
 
 def writable_folder(folder: Path) -> None:
@@ -25,3 +25,8 @@ def write_atomically(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+def outputs_folder(outputs: str, profile: str) -> Path:
+    """Where a notebook's outputs go: the folder it was given, or outputs/<profile> of the project for ''."""
+    return Path(outputs) if outputs else ROOT / "outputs" / profile

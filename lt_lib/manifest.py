@@ -39,7 +39,7 @@ def versions(requirements: Path) -> dict[str, str]:
 
 
 def git_state(root: Path) -> dict[str, Any]:
-    """The commit that is checked out and whether anything but outputs differs from it; None and None outside git."""
+    """The commit checked out and whether anything but outputs differs from it; None and None outside git."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(root), *arguments]
@@ -55,7 +55,9 @@ def git_state(root: Path) -> dict[str, Any]:
 def machine() -> dict[str, Any]:
     """Processor, cores that we may use, and memory in GiB."""
     info = Path("/proc/cpuinfo")
-    models = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", flags=re.MULTILINE)
+    models = re.findall(
+        r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", flags=re.MULTILINE
+    )
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "cpu": models[0] if models else platform.processor(),

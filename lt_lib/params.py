@@ -1,4 +1,4 @@
-"""Validated settings: the base class of every configuration, and the profiles that run_all.py hands to the notebooks."""
+"""Validated settings: the base of every configuration, and the profiles run_all.py gives to notebooks."""
 
 import ast
 import json
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class UserError(Exception):
-    """A mistake in what a person gave us; the message is one line that names it and says what would be right."""
+    """A mistake in what a person gave us; its one line names it and says what would be right."""
 
 
 def _frozen(value: Any) -> Any:
@@ -34,7 +34,7 @@ def _frozen(value: Any) -> Any:
 
 
 class Settings(BaseModel):
-    """Base of every configuration: immutable, strictly typed, unknown keys refused; lists are taken for tuples."""
+    """Base of every configuration: immutable, strictly typed, no unknown keys; lists are taken for tuples."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -66,7 +66,7 @@ def notebook_defaults(path: Path) -> dict[str, Any]:
     try:
         return {node.targets[0].id: ast.literal_eval(node.value) for node in body}
     except (AttributeError, ValueError):
-        raise UserError(f"{path.name}: the parameters cell may hold only lines such as name = literal") from None
+        raise UserError(f"{path.name}: its parameters cell may hold only name = literal") from None
 
 
 def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
@@ -75,11 +75,12 @@ def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
     A notebook's own section goes over `shared`, whose keys reach every notebook that declares them. A value
     replaces the notebook's default as a whole, dicts included.
 
-    Raises UserError for an unknown profile, notebook or parameter, and for a value of the wrong type or range.
+    Raises UserError for an unknown profile, notebook or parameter, or a value of the wrong type or range.
     """
     if name not in profile_names(root):
         raise UserError(f"unknown profile {name!r}; there are {', '.join(profile_names(root))}")
-    defaults = {book: notebook_defaults(root / "notebooks" / f"{book}.ipynb") for book in notebook_names(root)}
+    folder = root / "notebooks"
+    defaults = {book: notebook_defaults(folder / f"{book}.ipynb") for book in notebook_names(root)}
     sections = _read_sections(root / "params" / f"{name}.yaml", defaults)
     shared = sections.pop("shared", {})
     profile = {}
@@ -97,7 +98,7 @@ class _UniqueKeys(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         for key, count in Counter(self.construct_object(key) for key, _ in node.value).items():
             if count > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"{key!r} is given twice", node.start_mark)
+                raise yaml.MarkedYAMLError(problem=f"{key!r} is given twice", problem_mark=node.start_mark)
         return super().construct_mapping(node, deep)
 
 
@@ -113,11 +114,12 @@ def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dic
         if section != "shared" and section not in defaults:
             raise UserError(f"{path.name}: unknown notebook {section!r}; there are {', '.join(defaults)}")
         if not isinstance(values, dict):
-            raise UserError(f"{path.name}: {section}: expected parameters in braces or below it, got {values!r}")
+            raise UserError(f"{path.name}: {section}: expected its parameters below it, got {values!r}")
     declared = {key for names in defaults.values() for key in names}
     for key in sections.get("shared", {}):
         if key not in declared:
-            raise UserError(f"{path.name}: shared: no notebook declares {key!r}; there are {_listed(declared)}")
+            known = _listed(declared)
+            raise UserError(f"{path.name}: shared: no notebook declares {key!r}; there are {known}")
     return sections
 
 
@@ -138,7 +140,7 @@ def _check_value(where: str, key: str, value: Any, declared: Mapping[str, Any]) 
 
 
 def _same_type(value: Any, default: Any) -> bool:
-    """Whether a value may stand for a default: the same type, or an int for a float; lists hold what theirs holds."""
+    """Whether a value may stand for a default: the same type, int for float, lists item by item."""
     if isinstance(default, list) and isinstance(value, list) and default:
         return all(any(_same_type(item, example) for example in default) for item in value)
     return type(value) is type(default) or (type(default) is float and type(value) is int)
@@ -161,8 +163,6 @@ def _listed(names: Any) -> str:
 # --- settings
 Share = Annotated[float, Field(ge=0, le=1)]
 Precision = Literal["float32", "bfloat16"]
-Content = Literal["floor", "position", "trajectory", "latent", "predicted", "raw", "oracle"]
-Wire = Literal["intact", "content_zeroed", "wire_zeroed", "sender_shuffled", "matched_noise"]
 
 
 class Training(Settings):
@@ -182,8 +182,8 @@ class EncoderConfig(Training):
     lr: PositiveFloat = 1e-3
     ema: Annotated[float, Field(ge=0, lt=1)] = 0.99
     prediction: NonNegativeFloat = 1.0
-    variance: NonNegativeFloat = 1.0
-    covariance: NonNegativeFloat = 0.1
+    variance: NonNegativeFloat = 25.0
+    covariance: NonNegativeFloat = 2.5
     reconstruction: NonNegativeFloat = 1.0
 
 
@@ -219,16 +219,16 @@ class ExecutorConfig(Training):
     steps: PositiveInt = 1_000_000
     envs: PositiveInt = 64
     rollout: PositiveInt = 128  # control steps an environment and update
-    minibatch: PositiveInt = 1024
+    minibatch: PositiveInt = 256
     lr: PositiveFloat = 2.5e-4
     ppo: PpoConfig = PpoConfig()
     precision: Precision = "float32"
 
 
 class BankConfig(Training):
-    """Episodes of the frozen executor for every (draw of the scene, slab, route), shared by all message contents."""
+    """One shard of the episode bank: the frozen executor on every (draw of the scene, slab, route)."""
 
-    entries: PositiveInt = 2048  # draws of spawn and scout pose
+    entries: PositiveInt = 256  # draws of spawn and scout pose
     envs: PositiveInt = 64
     commit_step: NonNegativeInt = 2
     precision: Precision = "float32"
@@ -237,8 +237,8 @@ class BankConfig(Training):
 class HeadConfig(Training):
     """Stage 2: the route head, trained from episode reward alone (Section Implementation)."""
 
-    content: Content
-    wire: Wire = "intact"
+    content: str = "latent"  # a name in comm.messages.CONTENTS
+    wire: str = "intact"  # a name in comm.channel.CORRUPTIONS
     held_out: Share = 0.125  # of the bank's draws, kept for evaluation
     episodes: PositiveInt = 6_000
     batch: PositiveInt = 256
@@ -250,8 +250,8 @@ class HeadConfig(Training):
 class EvaluationConfig(Training):
     """One cell of Table IV: a frozen head under one wire condition."""
 
-    content: Content
-    wire: Wire
+    content: str
+    wire: str
     held_out: Share = 0.125
     episodes: PositiveInt = 256
 
@@ -262,4 +262,5 @@ SECTIONS: dict[str, type[Settings]] = {
     "gates": Gates,
     "executor": ExecutorConfig,
     "bank": BankConfig,
+    "head": HeadConfig,
 }

@@ -1,6 +1,6 @@
 """How far the runs in flight are, told through small files, since each works in a process of its own.
 
-`<store>/inflight/<process>/stage.json` tells of one fetch, `<store>/inflight/<process>/<key>.json` of one of its runs.
+`<store>/inflight/<process>/stage.json` tells of one fetch, `<key>.json` beside it of one of its runs.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ class Reporter:
 
 @contextlib.contextmanager
 def stage(folder: Path, what: str, total: int) -> Iterator[tuple[Path, Callable[[str], None]]]:
-    """Tells of `total` runs until the block ends: (folder for their reporters' files, to call with a finished key).
+    """Tells of `total` runs until the block ends: (folder for reporters' files, to call with a finished key).
 
     On a terminal it draws a bar besides.
     """
@@ -57,7 +57,7 @@ def stage(folder: Path, what: str, total: int) -> Iterator[tuple[Path, Callable[
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a fetch stands: runs done of all, the fraction with those in flight, seconds so far and to come."""
+    """Where a fetch stands: runs done, the fraction with those in flight, seconds so far and to come."""
 
     what: str
     done: int
@@ -68,8 +68,12 @@ class Progress:
 
 
 def read_progress(folder: Path, since: float) -> Progress | None:
-    """The fetch in a store's folder that was last to start at or after `since` (seconds of the epoch), if any."""
-    stages = [(told["started"], path, told) for path in folder.glob("inflight/*/stage.json") if (told := _read(path))]
+    """The fetch in a store that was last to start, if it was at or after `since` (seconds of the epoch)."""
+    stages = [
+        (told["started"], path, told)
+        for path in folder.glob("inflight/*/stage.json")
+        if (told := _read(path))
+    ]
     started, path, told = max(stages, default=(0.0, None, None), key=lambda stage: stage[0])
     if path is None or started < since:
         return None

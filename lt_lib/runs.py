@@ -36,12 +36,19 @@ Result = dict[str, Any]
 # What a result may change with besides our own code.
 LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn")
 ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+    (
+        "OMP_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    ),
+    "1",
 )
 
 
 class RunError(Exception):
-    """A run's function raised: the first line names the run and the error, the worker's traceback is its cause."""
+    """A run's function raised: the message names the run and the error, which is its cause."""
 
 
 @dataclass(frozen=True)
@@ -55,24 +62,28 @@ class Run:
 
     def __post_init__(self) -> None:
         if self.function.__module__ == "__main__" or "." in self.function.__qualname__:
-            raise ValueError(f"{self.function.__qualname__} must be a module's own function for workers to import it")
+            raise ValueError(
+                f"{self.function.__qualname__} must be a module's own function for workers to import it"
+            )
 
     def key(self) -> str:
-        """sha256 of all that the result depends on: the call, the inputs' contents, our source, library versions."""
+        """sha256 of all that the result depends on: call, contents of inputs, source, library versions."""
         module = sys.modules[self.function.__module__]
         folder = Path(module.__file__).resolve().parents[module.__name__.count(".")]
         parts = {
             "function": f"{self.function.__module__}.{self.function.__qualname__}",
             "config": self.config.model_dump(mode="json"),
             "seed": self.seed,
-            "inputs": {name: hashlib.sha256(pack(result)).hexdigest() for name, result in self.inputs.items()},
+            "inputs": {
+                name: hashlib.sha256(pack(result)).hexdigest() for name, result in self.inputs.items()
+            },
             "source": source_digest(self.function, type(self.config), folder=folder),
             "libraries": library_versions(),
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def __str__(self) -> str:
-        changed = self.config.model_dump(mode="json", exclude_defaults=True)
+        changed = self.config.model_dump(mode="json", exclude_defaults=True, exclude_computed_fields=True)
         settings = "".join(f", {name}={value!r}" for name, value in changed.items())
         return f"{self.function.__name__}(seed={self.seed}{settings})"
 
@@ -81,7 +92,7 @@ class Run:
 class RunStore:
     """Finished runs in a folder, `<folder>/<function>/<key>.run`, and the workers that compute missing ones.
 
-    workers: processes at a time, 0 for one a core; each computes with one thread, so results do not depend on it.
+    workers: processes at a time, 0 for one a core. Each has one thread, so that results do not depend on it.
     """
 
     folder: Path
@@ -119,13 +130,15 @@ class RunStore:
         return unpack(payload)
 
     def _compute(self, missing: Mapping[str, Run], what: str) -> None:
-        """Every missing run in worker processes that start now, so that they run the source that was digested."""
+        """Computes runs in worker processes that start now, and so run the source that was digested."""
         processes = min(self.workers or joblib.cpu_count(), len(missing))
         journal = self.folder / "journal.jsonl"
         failures = []
         with stage(self.folder, what, len(missing)) as (progress, finished), _workers(processes) as pool:
             futures = {
-                pool.submit(_compute_run, run, key, self._path(key, run), journal, progress / f"{key}.json"): key
+                pool.submit(
+                    _compute_run, run, key, self._path(key, run), journal, progress / f"{key}.json"
+                ): key
                 for key, run in missing.items()
             }
             for future in as_completed(futures):

@@ -1,4 +1,4 @@
-"""Which of our own source a function depends on, so that a kept result is used only while that source stands."""
+"""Which of our source a function depends on, so that a kept result is used only while that source stands."""
 
 import ast
 import hashlib
@@ -40,7 +40,7 @@ def _modules(folder: Path, name: str) -> Iterator[tuple[str, str, Path]]:
 
 @lru_cache(maxsize=1000)
 def _read(path: Path, modified_ns: int, module: str, definition: str) -> tuple[str, frozenset[str]]:
-    """The code of a module, or of one definition and what it uses there, and the dotted names that it imports.
+    """The code of a module, or of one definition and what it uses there, and the dotted names it imports.
 
     `modified_ns` is the file's time, so that an edited file is read anew.
     """
@@ -51,7 +51,7 @@ def _read(path: Path, modified_ns: int, module: str, definition: str) -> tuple[s
 
 
 def _used_by(definition: str, body: Sequence[ast.stmt]) -> Sequence[ast.stmt]:
-    """The statement that defines a name and those that define the names it uses; all of them if none defines it."""
+    """The statements that define a name and the names it uses; all of them if none defines it."""
     defined = {name: node for node in body for name in _names_defined(node)}
     if definition not in defined:
         return body

@@ -1,4 +1,4 @@
-"""run_all.py from its command line, on a small project of its own: bad input, failures, progress, kill and resume."""
+"""run_all.py from its command line, on a small project of its own: bad input, failures, kill and resume."""
 
 import json
 import os
@@ -16,7 +16,8 @@ from toy_runs import ToyConfig, train_toy
 
 from lt_lib import params
 from lt_lib.params import ROOT, UserError, explain, load_profile
-from run_all import choose, clock, main
+from lt_lib.progress import Progress
+from run_all import choose, clock, describe, main
 
 PARAMETERS = """profile = "smoke"
 outputs = ""
@@ -51,7 +52,7 @@ def write_notebook(root: Path, name: str, *cells: str, parameters: str = PARAMET
 
 @pytest.fixture
 def project(tmp_path, monkeypatch):
-    """A project's root with two notebooks that compute; its notebooks find our modules, and its params theirs."""
+    """A project's root with two notebooks that compute; they find our modules, and we their settings."""
     root = tmp_path / "project"
     for folder in ("notebooks", "params"):
         (root / folder).mkdir(parents=True)
@@ -87,11 +88,20 @@ def losses(root: Path, name: str) -> list[float]:
         ("02_encoder: {seeds: 2.0}", "smoke.yaml: 02_encoder: seeds: expected int such as 2, got 2.0"),
         ("shared: {share: 3e-4}", "smoke.yaml: 02_encoder: share: expected float such as 0.5, got '3e-4'"),
         ("02_encoder: {content: 3}", "smoke.yaml: 02_encoder: content: expected str such as 'latent', got 3"),
-        ("02_encoder: {sizes: [1, a]}", "smoke.yaml: 02_encoder: sizes: expected list such as [1, 2], got [1, 'a']"),
+        (
+            "02_encoder: {sizes: [1, a]}",
+            "smoke.yaml: 02_encoder: sizes: expected list such as [1, 2], got [1, 'a']",
+        ),
         ("02_encoder: {toy: {size: 0}}", "smoke.yaml: 02_encoder: toy.size: must be greater than 0, got 0"),
-        ("02_encoder: {toy: {sizes: 1}}", "smoke.yaml: 02_encoder: toy.sizes: unknown parameter; toy has fails, seconds, size"),
-        ("02_encoder: {toy: {size: '4'}}", "smoke.yaml: 02_encoder: toy.size: must be a valid integer, got '4'"),
-        ("02_encoder: 3", "smoke.yaml: 02_encoder: expected parameters "),
+        (
+            "02_encoder: {toy: {sizes: 1}}",
+            "smoke.yaml: 02_encoder: toy.sizes: unknown parameter; toy has fails, seconds, size",
+        ),
+        (
+            "02_encoder: {toy: {size: '4'}}",
+            "smoke.yaml: 02_encoder: toy.size: must be a valid integer, got '4'",
+        ),
+        ("02_encoder: 3", "smoke.yaml: 02_encoder: expected its parameters "),
         ("- 3", "smoke.yaml: expected sections such as 'shared:', got [3]"),
         ("02_encoder: {toy: [", "smoke.yaml: not valid yaml: "),
         ("02_encoder: {}\n02_encoder: {seeds: 3}", "smoke.yaml: not valid yaml: '02_encoder' is given twice"),
@@ -108,7 +118,10 @@ def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml,
         (["--profile", "tiny"], "unknown profile 'tiny'; there are smoke"),
         (["--profile", "claims"], "unknown profile 'claims'; there are smoke"),
         (["--profile", "../params/smoke"], "unknown profile '../params/smoke'; there are smoke"),
-        (["--profile", "smoke", "--only", "pixels"], "argument --only: unknown notebook 'pixels'; there are 02_encoder"),
+        (
+            ["--profile", "smoke", "--only", "pixels"],
+            "argument --only: unknown notebook 'pixels'; there are 02_encoder",
+        ),
         (["--profile", "smoke", "--workers", "-1"], "argument --workers: expected 0 or more, got -1"),
         (["--profile", "smoke", "--workers", "two"], "argument --workers: invalid int value: 'two'"),
         (["--profile", "smoke", "--fast"], "unrecognized arguments: --fast"),
@@ -123,9 +136,12 @@ def test_a_bad_option_is_one_line_and_nothing_is_computed(project, capfd, monkey
 @pytest.mark.parametrize(
     ("parameters", "complaint"),
     [
-        ("seeds = 2\ntoy = {}", "02_encoder.ipynb: its parameters cell must declare outputs, profile, workers"),
-        ("seeds = 1 + 1", "02_encoder.ipynb: the parameters cell may hold only lines such as name = literal"),
-        ("import os", "02_encoder.ipynb: the parameters cell may hold only lines such as name = literal"),
+        (
+            "seeds = 2\ntoy = {}",
+            "02_encoder.ipynb: its parameters cell must declare outputs, profile, workers",
+        ),
+        ("seeds = 1 + 1", "02_encoder.ipynb: its parameters cell may hold only name = literal"),
+        ("import os", "02_encoder.ipynb: its parameters cell may hold only name = literal"),
     ],
 )
 def test_a_bad_parameters_cell_is_one_line(project, capfd, parameters, complaint):
@@ -207,6 +223,21 @@ def test_clock(seconds, shown):
     assert clock(seconds) == shown
 
 
+@pytest.mark.parametrize(
+    ("progress", "line"),
+    [
+        (None, "1:00"),
+        (Progress("route heads", 0, 35, 0.0, 4.0, None), "1:00  route heads 0/35 (0%)"),
+        (
+            Progress("route heads", 12, 35, 0.34, 60.0, 130.0),
+            "1:00  route heads 12/35 (34%), about 2:10 left",
+        ),
+    ],
+)
+def test_the_live_line_tells_runs_and_time_left(progress, line):
+    assert describe(progress, 60.0) == line
+
+
 def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd):
     assert smoke(project) == 0
     outputs = project / "outputs" / "smoke"
@@ -221,28 +252,42 @@ def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd)
     assert set(manifest["versions"]) == {"python", "numpy"}
     assert manifest["machine"]["cores"] >= 1
     out = capfd.readouterr().out.splitlines()
-    assert [line.split()[:2] for line in out if "toys" not in line][:2] == [["02_encoder", "ok"], ["03_gridworld", "ok"]]
+    assert [line.split()[:2] for line in out if "toys" not in line][:2] == [
+        ["02_encoder", "ok"],
+        ["03_gridworld", "ok"],
+    ]
 
 
 def test_a_scoreboard_is_summed_up_in_the_last_line(project, capfd):
-    table = 'Path("outputs/smoke/scoreboard.csv").write_text("id,verdict\\na,reproduced\\nb,not run\\nc,reproduced")'
-    write_notebook(project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, WRITE)
+    rows = r"id,verdict\na,reproduced\nb,not run\nc,reproduced"
+    table = f'Path("outputs/smoke/scoreboard.csv").write_text("{rows}")'
+    write_notebook(
+        project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, WRITE
+    )
     assert smoke(project, "--only", "09") == 0
     assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: 2 reproduced, 1 not run"
 
 
 def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(project, capfd):
-    for name, cells in {"02_encoder": [COMPUTE, RAISE], "04_pixels": [COMPUTE, WRITE], "07_corruption": []}.items():
+    for name, cells in {
+        "02_encoder": [COMPUTE, RAISE],
+        "04_pixels": [COMPUTE, WRITE],
+        "07_corruption": [],
+    }.items():
         write_notebook(project, name, *cells)
     write_notebook(project, "03_gridworld", COMPUTE, "raise SystemExit(0)", WRITE)
-    write_notebook(project, "08_hardware_decode", "results = [{'loss': 1}]\nimport json\nfrom pathlib import Path", WRITE)
+    write_notebook(
+        project, "08_hardware_decode", "results = [{'loss': 1}]\nimport json\nfrom pathlib import Path", WRITE
+    )
     stale = project / "outputs" / "smoke" / "results" / "03_gridworld.json"
     stale.parent.mkdir(parents=True)
     stale.write_text("[]")
     assert smoke(project) == 1
     lines = {line.split()[0]: line for line in capfd.readouterr().out.splitlines() if "toys" not in line}
     assert "FAILED" in lines["02_encoder"]
-    assert lines["02_encoder"].endswith("cell 3: ValueError: the gate (log: outputs/smoke/logs/02_encoder.log)")
+    assert lines["02_encoder"].endswith(
+        "cell 3: ValueError: the gate (log: outputs/smoke/logs/02_encoder.log)"
+    )
     assert "ValueError: the gate" in (project / "outputs" / "smoke" / "logs" / "02_encoder.log").read_text()
     assert "ended without writing outputs/smoke/results/03_gridworld.json" in lines["03_gridworld"]
     assert "skipped" in lines["04_pixels"]
@@ -258,7 +303,9 @@ def test_a_lost_kernel_is_a_failed_notebook(project, capfd):
     assert "FAILED" in capfd.readouterr().out
 
 
-def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_writes_where_told(project, tmp_path):
+def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_writes_where_told(
+    project, tmp_path
+):
     for only in ("02", "gridworld"):
         assert smoke(project, "--only", only, "--outputs", str(tmp_path / "elsewhere")) == 0
     manifest = json.loads((tmp_path / "elsewhere" / "manifest.json").read_text())
@@ -272,9 +319,9 @@ START = "import sys, pathlib, run_all; sys.exit(run_all.main(sys.argv[2:], pathl
 
 
 def start(root: Path) -> subprocess.Popen:
-    """run_all in a process of its own, on notebook 02 with runs of one second, one at a time."""
+    """run_all in a process of its own, on notebook 02 with runs of 1.5 seconds, one at a time."""
     # The process has no settings for 'toy', so the notebook has it by default.
-    parameters = PARAMETERS.replace("toy = {}", "toy = {'seconds': 1.0}").replace("seeds = 2", "seeds = 3")
+    parameters = PARAMETERS.replace("toy = {}", "toy = {'seconds': 1.5}").replace("seeds = 2", "seeds = 3")
     write_notebook(root, "02_encoder", COMPUTE, WRITE, parameters=parameters)
     (root / "params" / "smoke.yaml").write_text("")
     command = [sys.executable, "-c", START, str(root), "--profile", "smoke", "--only", "02", "--workers", "1"]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import computed_field
 from toy_runs import ToyConfig, count_threads, lose_worker, train_toy
 
 from lt_lib.params import UserError
@@ -84,7 +85,25 @@ def test_key_follows_function_config_seed_and_the_contents_of_inputs():
         Run(train_toy, ToyConfig(), 0, {"start": {"weights": np.ones((4, 3))}}),
     ]
     assert len({run.key() for run in runs}) == len(runs)
-    assert Run(train_toy, ToyConfig(size=4), 0, {"start": {"weights": np.zeros((4, 3))}}).key() == runs[4].key()
+    assert (
+        Run(train_toy, ToyConfig(size=4), 0, {"start": {"weights": np.zeros((4, 3))}}).key() == runs[4].key()
+    )
+
+
+def test_key_follows_what_settings_compute_and_its_name_in_errors_does_not(tmp_path):
+    path = tmp_path / "layout.yaml"
+
+    class SceneConfig(ToyConfig):
+        @computed_field
+        def layout(self) -> str:
+            return path.read_text()
+
+    path.write_text("narrow")
+    run = Run(train_toy, SceneConfig(), 0)
+    before = run.key()
+    path.write_text("wide")
+    assert run.key() != before
+    assert str(run) == "train_toy(seed=0)"
 
 
 @pytest.mark.parametrize("library", ["torch", "numpy", "mujoco"])
@@ -105,13 +124,15 @@ def test_a_function_that_workers_cannot_import_is_refused():
 
 LAB = {
     "lab/__init__.py": "",
-    "lab/train.py": '"""Doc."""\nfrom lab.deep import layer\nfrom lt_lib.params import TrainConfig\ndef train(): pass\n',
+    "lab/train.py": '"""Doc."""\n'
+    "from lab.deep import layer\nfrom lt_lib.params import TrainConfig\ndef train(): pass\n",
     "lab/deep/__init__.py": "WIDTH = 3\n",
     "lab/deep/layer.py": "def layer():\n    from .. import lazy\n    return 1\n",
     "lab/lazy.py": "import numpy\n",
     "lab/unrelated.py": "from lab import train\n",
     "lt_lib/__init__.py": "",
-    "lt_lib/params.py": "class Base: pass\nclass TrainConfig(Base): size = 1\nclass OtherConfig(Base): size = 1\n",
+    "lt_lib/params.py": "class Base: pass\n"
+    "class TrainConfig(Base): size = 1\nclass OtherConfig(Base): size = 1\n",
 }
 
 
@@ -153,7 +174,7 @@ def test_digest_changes_with_code_that_is_imported(lab_digest, file, old, new):
     [
         ("lab/unrelated.py", "train", "deep"),
         ("lab/train.py", "Doc.", "Another docstring."),
-        ("lab/train.py", "def train(): pass", "# why\ndef train():\n    pass"),
+        ("lab/train.py", "def train(): pass", "# why\ndef train():\n    'What it does.'\n    pass"),
         ("lt_lib/params.py", "OtherConfig(Base): size = 1", "OtherConfig(Base): size = 2"),
     ],
 )
@@ -190,7 +211,9 @@ def test_a_worker_has_one_thread(tmp_path, workers):
     assert threads == {"torch": 1, "numba": 1}
 
 
-@pytest.mark.parametrize("damage", [lambda old: old[:-20], lambda old: old[:-1] + bytes([old[-1] ^ 1]), lambda old: b""])
+@pytest.mark.parametrize(
+    "damage", [lambda old: old[:-20], lambda old: old[:-1] + bytes([old[-1] ^ 1]), lambda old: b""]
+)
 def test_a_damaged_file_is_named_and_computed_again(finished, caplog, damage):
     store, result, path = finished
     whole = path.read_bytes()
@@ -207,7 +230,9 @@ def test_a_damaged_file_is_named_and_computed_again(finished, caplog, damage):
 
 def test_a_failing_run_is_named_and_the_others_are_kept(tmp_path):
     bad = Run(train_toy, ToyConfig(size=2, fails=True), 7)
-    with pytest.raises(RunError, match=r"1 of 3 .*train_toy\(seed=7, size=2, fails=True\): ValueError: this seed"):
+    with pytest.raises(
+        RunError, match=r"1 of 3 .*train_toy\(seed=7, size=2, fails=True\): ValueError: this seed"
+    ):
         RunStore(tmp_path, workers=1).fetch([bad, *toys(2)], "toys")
     assert sorted(journal_keys(tmp_path)) == sorted(run.key() for run in toys(2))
 

@@ -24,12 +24,19 @@ def train_toy(config, seed, *, report, start=None):
         time.sleep(config.seconds / 10)
         report(step / 10)
     weights = np.random.default_rng(seed).normal(size=(config.size, 3))
-    return {"weights": weights + (start["weights"] if start else 0), "loss": float(weights[0, 0]), "names": ["a", "b"]}
+    return {
+        "weights": weights + (start["weights"] if start else 0),
+        "loss": float(weights[0, 0]),
+        "names": ["a", "b"],
+    }
 
 
 def count_threads(config, seed, *, report):
     """The threads that torch and numba would take in this worker."""
-    return {"torch": import_module("torch").get_num_threads(), "numba": import_module("numba").get_num_threads()}
+    return {
+        "torch": import_module("torch").get_num_threads(),
+        "numba": import_module("numba").get_num_threads(),
+    }
 
 
 def lose_worker(config, seed, *, report):

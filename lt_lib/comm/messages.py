@@ -76,4 +76,23 @@ def _padded(values) -> Float[Tensor, "b 64"]:
     return out
 
 
+class Condition(NamedTuple):
+    """A row of Table I: what is sent, what happens to the wire, and what the comparison needs it for."""
+
+    content: str
+    wire: str
+    role: str
+    words: str
+
+
 CONTENTS = {f.__name__: f for f in (floor, position, trajectory, latent, predicted, raw, oracle)}
+CONDITIONS = {
+    "latent": Condition("latent", "intact", "ours", "latent $z_t$"),
+    "predicted": Condition("predicted", "intact", "ours", r"predicted $\hat{z}_{t+1}$"),
+    "oracle": Condition("oracle", "intact", "diagnostic", "oracle (noiseless bit)"),
+    "raw": Condition("raw", "intact", "upper bound", "raw observation"),
+    "floor": Condition("floor", "intact", "lower bound", "floor (anchor + zeros)"),
+    "zero_wire": Condition("floor", "wire_zeroed", "lower bound", "floor, whole wire zeroed"),
+    "position": Condition("position", "intact", "kinematic", "position"),
+    "trajectory": Condition("trajectory", "intact", "kinematic", "trajectory"),
+}

@@ -20,7 +20,7 @@ class RouteDistance:
         self._origin = np.array([layout.arena.x[0], layout.arena.y[0]])
         self._maps = np.stack([_distance_map(layout, side) for side in range(len(SIDES))])  # (2, X, Y)
 
-    def __call__(self, position: Float[np.ndarray, "n 2"], route) -> Float[np.ndarray, "n"]:
+    def __call__(self, position: Float[np.ndarray, "n 2"], route) -> Float[np.ndarray, " n"]:
         cells = (position - self._origin) / RESOLUTION
         return map_coordinates(self._maps, [np.asarray(route), cells[:, 0], cells[:, 1]], order=1, mode="nearest")
 

@@ -1,6 +1,7 @@
 """The one description of the scene (Fig. 1b), in metres; physics, camera and occlusion check are made from it."""
 
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -149,7 +150,7 @@ class Layout(Settings):
         legs = [leg for corridor in self.routes for leg in corridor.legs]
         cuts = sorted({*self.barrier, *(x for leg in legs for x in leg.x if self.barrier[0] < x < self.barrier[1])})
         open_blocks, done = {}, []  # y interval -> x where the block began
-        for x0, x1 in zip(cuts[:-1], cuts[1:], strict=True):
+        for x0, x1 in pairwise(cuts):
             solid = set(_complement([leg.y for leg in legs if leg.x[0] <= x0 and x1 <= leg.x[1]], self.arena.y))
             done += [(start, x0, *y) for y, start in open_blocks.items() if y not in solid]
             open_blocks = {y: open_blocks.get(y, x0) for y in solid}
@@ -173,6 +174,9 @@ class Layout(Settings):
             raise ValueError(f"camera.height {self.camera.height} m must be below wall_height {self.wall_height} m")
         for side, corridor in zip(SIDES, self.routes, strict=True):
             self._check_corridor(side, corridor)
+        sizes = [(round(c.slab.x[1] - c.slab.x[0], 6), round(c.slab.y[1] - c.slab.y[0], 6)) for c in self.routes]
+        if sizes[0] != sizes[1]:  # one solid body is moved between the corridors
+            raise ValueError(f"the slab must be as large in either corridor, got {sizes[0]} m left, {sizes[1]} m right")
         for name in ("spawn", "scout", "goal"):
             self._check_standing(name, getattr(self, name))
         for i, point in enumerate(self.choice_points):

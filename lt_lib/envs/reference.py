@@ -1,17 +1,11 @@
 """The same scene drawn by MuJoCo's own renderer: the reference of the fast camera, and the pictures from above."""
 
-import os
-import sys
-
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is first imported
-
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from lt_lib.envs.camera import GOAL_PILLAR, INDEX, MATERIALS
-from lt_lib.envs.layout import Box, Layout
+from lt_lib.envs.layout import OUTER_THICKNESS, Box, Layout
 from lt_lib.params import UserError
 
 FACE = 1e-3  # metres: walls are drawn as thin faces, one colour a direction
@@ -55,11 +49,18 @@ class ReferenceCamera:
 
 
 class TopView:
-    """The arena from straight above, RGB frames for figures and GIFs."""
+    """The arena from straight above without perspective, RGB frames for figures and GIFs.
+
+    `extent` is the picture's (left, right, bottom, top) in metres.
+    """
 
     def __init__(self, layout: Layout, width: int = 480):
         (x0, x1), (y0, y1) = layout.arena.x, layout.arena.y
-        height = int(width * (y1 - y0 + 0.2) / (x1 - x0 + 0.2)) // 2 * 2
+        margin = 2 * OUTER_THICKNESS
+        height = int(width * (y1 - y0 + margin) / (x1 - x0 + margin)) // 2 * 2
+        tall = y1 - y0 + margin
+        middle, half = (x0 + x1) / 2, tall * width / height / 2
+        self.extent = (middle - half, middle + half, (y0 + y1 - tall) / 2, (y0 + y1 + tall) / 2)
         self._layout = layout
         self.model = mujoco.MjModel.from_xml_string(scene_xml(layout, max(width, height)))
         self._data = mujoco.MjData(self.model)
@@ -93,8 +94,6 @@ def scene_xml(layout: Layout, pixels: int) -> str:
     slab = layout.slab(0)
     sx, sy = slab.bounds[1] - slab.bounds[0], slab.bounds[3] - slab.bounds[2]
     centred = Box((-sx / 2, sx / 2, -sy / 2, sy / 2), slab.height, "slab")
-    altitude = 30.0
-    top_fov = 2 * np.rad2deg(np.arctan((y1 - y0 + 0.2) / 2 / (altitude - layout.wall_height)))
     return f"""
 <mujoco>
   <statistic extent="1" center="0 0 0"/>
@@ -106,7 +105,8 @@ def scene_xml(layout: Layout, pixels: int) -> str:
   </visual>
   <asset><texture type="skybox" builtin="flat" rgb1="{_rgb('sky')}" width="8" height="48"/></asset>
   <worldbody>
-    <camera name="above" pos="{(x0 + x1) / 2} {(y0 + y1) / 2} {altitude}" fovy="{top_fov}"/>
+    <camera name="above" projection="orthographic" pos="{(x0 + x1) / 2} {(y0 + y1) / 2} {2 * layout.wall_height}"
+            fovy="{y1 - y0 + 2 * OUTER_THICKNESS}"/>
     <geom name="floor:0" type="plane" size="50 50 1" group="{SEEN}" {_rgba("floor")}/>
     {walls}{above}
     <geom name="goal:0" type="cylinder" pos="{layout.goal.x} {layout.goal.y} {GOAL_PILLAR[1] / 2}"

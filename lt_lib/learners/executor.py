@@ -12,16 +12,19 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena
+from lt_lib.envs.arena import NO_CORRIDOR, Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.geodesic import RouteDistance
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.learners import ppo
 from lt_lib.params import ExecutorConfig
 from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder, best_device
+from lt_lib.perception.frames import free_poses
 
 ROUTES = 2
 HIDDEN = 128
+FROM_SPAWN = 0.5  # share of pretraining episodes that start at the spawn
+TIME_LIMIT = 300  # control steps of a pretraining episode; a time-out is bootstrapped, not punished
 ENTERED, DISOBEYED, ARRIVED, BLOCKED = 2.0, -5.0, 5.0, 5.0  # rewards; BLOCKED is reaching a commanded corridor's slab
 
 
@@ -93,7 +96,7 @@ class Driving:
         self._entered |= inside
         rewards = self._potential() - before  # undiscounted: gamma < 1 would pay for standing far away
         rewards = rewards + ENTERED * first + DISOBEYED * wrong + ARRIVED * arrived + BLOCKED * blocked
-        ended = terminated | (self._age >= HORIZON)
+        ended = terminated | (self._age >= TIME_LIMIT)
         following = self.observe()
         obedient = arrived | blocked
         if ended.any():
@@ -105,11 +108,17 @@ class Driving:
         return -self._distance(self._arena.pose[:, :2], self.route)
 
     def _restart(self, which):
-        n, rng = len(which), self._rng
-        slab, scout = rng.integers(0, 2, n), self._layout.scout.sample(n, rng)
-        self._arena.reset(which, self._layout.spawn.sample(n, rng), slab, scout)
-        self.route = np.where(which, rng.integers(0, ROUTES, n), self.route)
-        self._entered &= ~which
+        """New episodes: half from the spawn, half from anywhere outside the corridor that was not commanded."""
+        n, rng, layout = len(which), self._rng, self._layout
+        slab, route, scout = rng.integers(0, 2, n), rng.integers(0, ROUTES, n), layout.scout.sample(n, rng)
+        anywhere = free_poses(layout, slab, rng, apart_from=scout)
+        anywhere[:, 2] /= 2  # looking ahead, within +- 90 degrees
+        left, right = layout.routes
+        wrong = np.where(route == 0, right.contains(*anywhere.T[:2]), left.contains(*anywhere.T[:2]))
+        start = np.where(((rng.random(n) < FROM_SPAWN) | wrong)[:, None], layout.spawn.sample(n, rng), anywhere)
+        self._arena.reset(which, start, slab, scout)
+        self.route = np.where(which, route, self.route)
+        self._entered = np.where(which, self._arena.corridor == self.route, self._entered)
         self._age[which] = 0
 
 

@@ -3,7 +3,7 @@
 Clip 0.2, four epochs, entropy coefficient 0.01, gamma 0.99, lambda 0.95, the same for every seed and condition.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ MAX_GRADIENT_NORM = 0.5
 VALUE_COEFFICIENT = 0.5
 
 
+@runtime_checkable
 class Policy(Protocol):
     """A policy that PPO can improve: an nn.Module with one method."""
 

@@ -128,6 +128,12 @@ def _played(outcomes: Outcomes, entry: Int[np.ndarray, "b"], slab: Int[np.ndarra
 def evaluate_head(config: EvaluationConfig, seed: int, *, report: Callable[[float], None], head: Mapping[str, np.ndarray], bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]) -> dict:
     """One cell of Table IV: a frozen trained head under one wire condition, greedily."""
     _, held_out = read_bank(config, bank, encoder)
-    trained = RouteHead(held_out.wires.shape[-1])
-    trained.load_state_dict({k.removeprefix("head."): torch.tensor(v) for k, v in head.items() if k.startswith("head.")})
-    return evaluate(trained, held_out, config.wire, np.random.default_rng([seed, 4]), config.episodes)
+    return evaluate(read_head(head), held_out, config.wire, np.random.default_rng([seed, 4]), config.episodes)
+
+
+def read_head(result: Mapping[str, np.ndarray]) -> RouteHead:
+    """The trained head in a result of `train_head`."""
+    weights = {k.removeprefix("head."): torch.tensor(v) for k, v in result.items() if k.startswith("head.")}
+    head = RouteHead(weights["hidden.0.weight"].shape[1])
+    head.load_state_dict(weights)
+    return head.requires_grad_(False)

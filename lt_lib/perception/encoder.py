@@ -29,6 +29,16 @@ class Encoder(nn.Module):
         return self.layers(frames.permute(0, 3, 1, 2))  # a channels-last view, no copy
 
 
+def architecture(encoder: Encoder) -> str:
+    """The encoder's layers in the paper's words, read off the module."""
+    convolutions = [layer for layer in encoder.layers if isinstance(layer, nn.Conv2d)]
+    channels, kernels, strides = (
+        ",".join(str(value) for value in values)
+        for values in zip(*((c.out_channels, c.kernel_size[0], c.stride[0]) for c in convolutions), strict=True)
+    )
+    return f"conv {channels} kernels {kernels} strides {strides} linear {encoder.layers[-1].out_features}"
+
+
 class Predictor(nn.Module):
     """Raw latent and action to the next raw latent (the paper's z-hat), as a residual."""
 

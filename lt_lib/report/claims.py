@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
@@ -136,7 +137,7 @@ def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
 def _parse(model: type[Settings], entry: Mapping[str, Any], where: str) -> Any:
     """An entry as a model, pydantic's complaint as one line."""
     try:
-        return model(**entry)
+        return model.model_validate(dict(entry))
     except ValidationError as error:
         raise UserError(explain(error, where, model)) from None
 
@@ -245,6 +246,19 @@ class Findings:
         _check_shape(self.claims[name], finding, where)
         self.found[name] = finding
 
+    def table(self) -> pd.DataFrame:
+        """What was found so far beside the paper's, for the notebook's own reader."""
+        rows = {
+            name: {
+                "what": self.claims[name].what, "paper": self.claims[name].paper, "ours": _short(finding.value),
+                "95% interval": "" if finding.low is None else f"{_short(finding.low)} to {_short(finding.high)}",
+                "test": finding.test, "p": "" if finding.p is None else f"{finding.p:.3g}",
+                "verdict": verdict(self.claims[name], finding, self.profile) or f"none at size {self.profile}",
+            }
+            for name, finding in self.found.items()
+        }  # fmt: skip
+        return pd.DataFrame.from_dict(rows, orient="index")
+
     def write(self, pending: Collection[str] = ()) -> Path:
         """Writes the results file, whole or not at all, and returns its path.
 
@@ -272,6 +286,13 @@ class Findings:
         writable_folder(self.path.parent)
         write_atomically(self.path, text.encode())
         return self.path
+
+
+def _short(value: Any) -> Any:
+    """Floats to four digits, lists too."""
+    if isinstance(value, tuple):
+        return ", ".join(str(_short(item)) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else value
 
 
 def _plain(item: Any) -> Any:

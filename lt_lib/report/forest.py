@@ -90,7 +90,9 @@ def _claim(axes: Axes, row: Mapping[str, Any], y: Number) -> None:
     text = f"{shown(row['paper'])}  →  {shown(row['ours'])}" if ours else shown(row["paper"])
     side = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 7.5}
     axes.text(1.01, y, mark.sign, color=mark.colour, fontweight="bold", **side)
-    axes.text(1.03, y, f"{text} {row['unit']}", color="0.5" if row["verdict"] == NOT_RUN else "black", **side)
+    axes.text(
+        1.035, y, f"{text} {row['unit']}", color="0.5" if row["verdict"] == NOT_RUN else "black", **side
+    )
 
 
 def _dot(axes: Axes, x: Number, y: Number, mark: Mark) -> None:

@@ -1,0 +1,79 @@
+"""Who can see the slab (Fig. 1c and d, Section Setup): hazard pixels, counted through any camera.
+
+The navigator must not see it from where it chooses its corridor, under either placement; the scout must.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lt_lib.envs.camera import HAZARD, FastCamera
+from lt_lib.envs.layout import SIDES, Layout, Pose
+from lt_lib.params import UserError
+
+PIXELS = 512  # the paper's occlusion frame is 512 x 512
+HEADINGS = np.arange(8) * np.pi / 4  # radians; the views overlap for a field of view over 45 degrees
+
+
+class Occlusion(NamedTuple):
+    """Hazard pixels a frame; the last axis is the placement of the slab, 0 left, 1 right."""
+
+    navigator: Int[np.ndarray, "points 2"]
+    scout: Int[np.ndarray, "2"]
+
+
+class SightMap(NamedTuple):
+    """`pixels` (X, Y): the most hazard pixels in any of 8 headings at (x, y) metres; NaN where no robot can stand."""
+
+    x: Float[np.ndarray, " x"]
+    y: Float[np.ndarray, " y"]
+    pixels: Float[np.ndarray, "x y"]
+
+
+def hazard_pixels(camera, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]) -> Int[np.ndarray, " b"]:
+    """Hazard pixels in each frame; arguments as for `FastCamera.frames`, of which `camera` has to have the call."""
+    return HAZARD[camera.frames(eyes, slabs, others)].sum(axis=(1, 2))
+
+
+def occlusion(layout: Layout, camera) -> Occlusion:
+    """The paper's check: the navigator at every choice point and the scout at its post, under both placements."""
+    navigator = [under_both(camera, point, layout.scout) for point in layout.choice_points]
+    return Occlusion(np.stack(navigator), under_both(camera, layout.scout, layout.spawn))
+
+
+def under_both(camera, eye: Pose, other: Pose) -> Int[np.ndarray, "2"]:
+    """Hazard pixels from one pose with the slab left and with the slab right; the other robot stands at `other`."""
+    return hazard_pixels(camera, np.tile(eye.array, (2, 1)), np.arange(2), np.tile(other.array[:2], (2, 1)))
+
+
+def require_occlusion(layout: Layout) -> None:
+    """Raises UserError, one line, if the navigator can see the slab from a choice point or the scout cannot."""
+    seen = occlusion(layout, FastCamera(layout, PIXELS))
+    for slab, side in enumerate(SIDES):
+        for i, pixels in enumerate(seen.navigator[:, slab]):
+            if pixels:
+                raise UserError(
+                    f"layout {layout.name}: the navigator sees the {side} slab from choice_points[{i}] "
+                    f"({pixels} of {PIXELS**2} pixels); move the point, or hide the slab behind a longer bend"
+                )
+        if not seen.scout[slab]:
+            raise UserError(
+                f"layout {layout.name}: the scout cannot see the slab in the {side} corridor; move it or turn it"
+            )
+
+
+def sight_map(layout: Layout, slab: int, spacing: float = 0.1, pixels: int = 256) -> SightMap:
+    """From where on the near side the slab (0 left, 1 right) can be seen, whatever the heading.
+
+    spacing  metres between grid points
+    pixels   width and height of the frames that are searched
+    """
+    x = np.arange(layout.arena.x[0], layout.barrier[0] + spacing / 2, spacing)
+    y = np.arange(layout.arena.y[0], layout.arena.y[1] + spacing / 2, spacing)
+    camera, most = FastCamera(layout, pixels), np.full((len(x), len(y)), np.nan)
+    for i, j in np.argwhere(layout.free(x[:, None], y, layout.robot.radius)):
+        eyes = np.column_stack([np.full_like(HEADINGS, x[i]), np.full_like(HEADINGS, y[j]), HEADINGS])
+        others = np.tile(layout.scout.array[:2], (len(eyes), 1))
+        most[i, j] = hazard_pixels(camera, eyes, np.full(len(eyes), slab), others).max()
+    return SightMap(x, y, most)

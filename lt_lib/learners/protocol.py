@@ -1,0 +1,129 @@
+"""The content-controlled protocol, stage by stage (Sections Overview, Setup): what the notebooks ask the run store for.
+
+Everything but the message is held fixed: one frozen encoder, one frozen executor, one bank of episodes, one head.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lt_lib.comm.channel import CORRUPTIONS
+from lt_lib.comm.messages import CONDITIONS
+from lt_lib.envs.layout import load_layout
+from lt_lib.learners.episodes import ROUTES, SLABS, roll_bank
+from lt_lib.learners.executor import train_executor
+from lt_lib.learners.route import evaluate_head, train_head
+from lt_lib.params import (
+    ROOT, SECTIONS, BankConfig, EncoderConfig, EvaluationConfig, ExecutorConfig, GateConfig, Gates, HeadConfig, Training,
+    UserError,
+)  # fmt: skip
+from lt_lib.perception.gates import measure_gates, require_gates
+from lt_lib.perception.jepa import train_encoder
+from lt_lib.perception.weights import load_frozen, save_frozen
+from lt_lib.runs import Result, Run, RunStore
+
+SEED = 0  # of the one encoder and the one executor, as in the paper; heads have seeds of their own
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The stages at one size.
+
+    weights  a folder of frozen encoder and executor to use, or None: train them
+    shards   how many runs the episode bank is split into
+    """
+
+    store: RunStore
+    encoder: EncoderConfig = EncoderConfig()
+    probe: GateConfig = GateConfig()
+    gates: Gates = Gates()
+    executor: ExecutorConfig = ExecutorConfig()
+    bank: BankConfig = BankConfig()
+    head: HeadConfig = HeadConfig()
+    shards: int = 8
+    weights: Path | None = None
+
+    @classmethod
+    def of(cls, layout: str, device: str, workers: int, weights: str = "", shards: int = 8, **sections: Mapping) -> "Protocol":
+        """From a notebook's parameters: `sections` are the dicts named as in params.SECTIONS."""
+        shared = {"layout": layout, "device": device}
+        configs = {
+            name: SECTIONS[name](**(shared if issubclass(SECTIONS[name], Training) else {}), **values)
+            for name, values in sections.items()
+        }
+        folder = ROOT / weights if weights else None
+        return cls(RunStore(ROOT / "outputs" / "runs", workers), shards=shards, weights=folder, **configs)
+
+    def trained_encoder(self) -> Result:
+        """E and P as trained (or as found in `weights`), before any gate."""
+        if self.weights:
+            return load_frozen(self.weights, "encoder", load_layout(self.encoder.layout))
+        return self.store.fetch([Run(train_encoder, self.encoder, SEED)], "encoder")[0]
+
+    def frozen_encoder(self) -> Result:
+        """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
+        trained = self.trained_encoder()
+        require_gates(self.gate_report(trained), self.gates)
+        return trained
+
+    def rivals(self) -> dict[str, Result]:
+        """What the objective must beat at the gates: the encoder before training, and trained by prediction alone."""
+        alone = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
+        configs = {"untrained": self.encoder.model_copy(update={"epochs": 0.0}), "prediction alone": self.encoder.model_copy(update=alone)}
+        runs = [Run(train_encoder, config, SEED) for config in configs.values()]
+        return dict(zip(configs, self.store.fetch(runs, "rival encoders"), strict=True))
+
+    def gate_report(self, encoder: Result) -> Result:
+        """Probes and rank of a checkpoint; see `perception.gates.Measured`."""
+        return self.store.fetch([Run(measure_gates, self.probe, SEED, {"encoder": encoder})], "freeze gates")[0]
+
+    def frozen_executor(self, encoder: Result) -> Result:
+        """The low-level controller, pretrained behind the frozen encoder."""
+        if self.weights:
+            return load_frozen(self.weights, "executor", load_layout(self.executor.layout))
+        return self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
+
+    def save_executor(self, executor: Result, folder: Path) -> Path:
+        """Keeps the frozen executor beside the frozen encoder."""
+        return save_frozen(folder, "executor", executor, load_layout(self.executor.layout), {"settings": self.executor.model_dump()})
+
+    def episode_bank(self, encoder: Result, executor: Result) -> Result:
+        """Every outcome of `shards` times `bank.entries` draws of the scene; arrays (entries, slab, route)."""
+        inputs = {"encoder": encoder, "executor": executor}
+        shards = self.store.fetch([Run(roll_bank, self.bank, shard, inputs) for shard in range(self.shards)], "episode bank")
+        return {name: np.concatenate([shard[name] for shard in shards]) for name in shards[0]}
+
+    def trained_heads(self, seeds: Mapping[str, int], bank: Result, encoder: Result) -> dict[str, list[Result]]:
+        """Stage 2: so many seeds of each condition of Table I, all with the same settings."""
+        runs = {
+            (name, seed): Run(train_head, self._head(name), seed, {"bank": bank, "encoder": encoder})
+            for name, count in seeds.items()
+            for seed in range(count)
+        }
+        results = dict(zip(runs, self.store.fetch(list(runs.values()), "route heads"), strict=True))
+        return {name: [results[name, seed] for seed in range(count)] for name, count in seeds.items()}
+
+    def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
+        """A frozen trained head under every wire condition of Table IV, greedily."""
+        inputs = {"head": _weights_only(head), "bank": bank, "encoder": encoder}
+        content = CONDITIONS[name].content
+        configs = [EvaluationConfig(content=content, wire=wire, layout=self.head.layout, episodes=episodes) for wire in CORRUPTIONS]
+        runs = [Run(evaluate_head, config, SEED, inputs) for config in configs]
+        return dict(zip(CORRUPTIONS, self.store.fetch(runs, f"corruption of {name}"), strict=True))
+
+    def _head(self, name: str) -> HeadConfig:
+        if name not in CONDITIONS:
+            raise UserError(f"unknown message condition '{name}'; known: {', '.join(CONDITIONS)}")
+        condition = CONDITIONS[name]
+        return self.head.model_copy(update={"content": condition.content, "wire": condition.wire})
+
+
+def _weights_only(head: Result) -> Result:
+    return {name: value for name, value in head.items() if name.startswith("head.")}
+
+
+def obedience(bank: Result) -> float:
+    """Share of the bank's episodes in which the executor entered the corridor that it was told to."""
+    return float((bank["entered"] == np.arange(ROUTES)).mean())

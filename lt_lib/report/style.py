@@ -1,0 +1,35 @@
+"""What all figures share: colours by role, the stamp of a size that gives no results, and where they are kept."""
+
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from lt_lib.report.claims import JUDGED
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart
+ROLES = {
+    "ours": "#0072B2", "diagnostic": "#009E73", "upper bound": "#E69F00",
+    "lower bound": "#666666", "kinematic": "#CC79A7",
+}  # fmt: skip
+CHANCE = {"color": "black", "ls": ":", "lw": 1.2, "zorder": 0}
+DPI = 130
+
+
+def chance_line(axes: Axes, level: float = 0.5) -> None:
+    axes.axhline(level, label="chance", **CHANCE)
+
+
+def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str) -> Figure:
+    """Says at the bottom what the figure is made of, stamps a smoke-sized one, and saves it as a PNG.
+
+    made_of  e.g. 'n = 5 seeds a condition, last 500 of 6,000 episodes'
+    name     of the file in <outputs>/figures, e.g. '04_routes'
+    """
+    figure.supxlabel(f"profile {profile}; {made_of}", fontsize=8, color="0.35")
+    if profile not in JUDGED:
+        figure.text(0.5, 0.5, "SMOKE: not a result", rotation=20, fontsize=34, alpha=0.13, ha="center", va="center")
+    folder = outputs / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.png", dpi=DPI)
+    return figure
