@@ -1,6 +1,7 @@
 """Validated settings: the base of every configuration, and the profiles run_all.py gives to notebooks."""
 
 import ast
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from pydantic import (
     PositiveInt,
     TypeAdapter,
     ValidationError,
+    computed_field,
     model_validator,
 )
 
@@ -161,6 +163,22 @@ def _listed(names: Any) -> str:
 
 
 # --- settings
+LAYOUTS = ROOT / "params" / "layouts"
+
+
+def layout_path(name: str) -> Path:
+    """The file of a layout: params/layouts/<name>.yaml, or a path to a yaml file of one's own.
+
+    Raises UserError for an unknown name.
+    """
+    path = Path(name) if name.endswith(".yaml") else LAYOUTS / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(each.stem for each in LAYOUTS.glob("*.yaml")))
+        raise UserError(f"unknown layout '{name}'; known: {known}, or the path of a .yaml file")
+    return path
+
+
+Device = Literal["auto", "cpu", "cuda"]
 Share = Annotated[float, Field(ge=0, le=1)]
 Precision = Literal["float32", "bfloat16"]
 
@@ -169,7 +187,13 @@ class Training(Settings):
     """What every training shares: the scene, and the device ('auto' is cuda where there is one)."""
 
     layout: str = "default"
-    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    device: Device = "cpu"
+
+    @computed_field
+    @property
+    def layout_digest(self) -> str:
+        """sha256 of the layout's file, so that an edited scene is another setting."""
+        return hashlib.sha256(layout_path(self.layout).read_bytes()).hexdigest()
 
 
 class EncoderConfig(Training):
@@ -256,11 +280,17 @@ class EvaluationConfig(Training):
     episodes: PositiveInt = 256
 
 
-SECTIONS: dict[str, type[Settings]] = {
+# How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
+SECTIONS: dict[str, Any] = {
     "encoder": EncoderConfig,
     "probe": GateConfig,
     "gates": Gates,
     "executor": ExecutorConfig,
     "bank": BankConfig,
     "head": HeadConfig,
+    "seeds": dict[str, PositiveInt],
+    "shards": PositiveInt,
+    "latent_heads": PositiveInt,
+    "episodes": PositiveInt,
+    "device": Device,
 }

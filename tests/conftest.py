@@ -3,8 +3,13 @@
 import os
 
 import jaxtyping
+import torch
 
 if "DISPLAY" not in os.environ:
     os.environ.setdefault("MUJOCO_GL", "egl")
+
+torch.set_num_threads(1)  # as in a run's worker; two would fight over the cores
+
+import lt_lib.envs.raycast  # noqa: F401  compiled code, imported before the checks so that they leave it alone
 
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")

@@ -7,8 +7,9 @@ import torch
 from lt_lib.comm.channel import CORRUPTIONS, deliver
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
-from lt_lib.envs.camera import PALETTE, FastCamera
+from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import load_layout
+from lt_lib.envs.materials import PALETTE
 from lt_lib.learners import ppo
 from lt_lib.learners.episodes import Draws, draw_scenes, drive, roll_bank
 from lt_lib.learners.executor import Executor, FrozenExecutor

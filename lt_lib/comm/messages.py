@@ -30,7 +30,7 @@ class Sender(NamedTuple):
     frames: UInt8[np.ndarray, "b h w"]
     pose: Float[np.ndarray, "b 3"]
     velocity: Float[np.ndarray, "b 2"]
-    slab: Int[np.ndarray, "b"]
+    slab: Int[np.ndarray, " b"]
 
 
 def floor(sender: Sender) -> Float[Tensor, "b 64"]:

@@ -23,7 +23,7 @@ class RouteHead(nn.Module):
     def policy(self, wire: Float[Tensor, "b w"]) -> torch.distributions.Categorical:
         return torch.distributions.Categorical(logits=self.logits(self.hidden(wire)))
 
-    def evaluate(self, observations: Float[Tensor, "b w"], actions: Int[Tensor, "b"]):
+    def evaluate(self, observations: Float[Tensor, "b w"], actions: Int[Tensor, " b"]):
         """Log-probability, entropy and value, each (b,)."""
         hidden = self.hidden(observations)
         policy = torch.distributions.Categorical(logits=self.logits(hidden))

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lt_lib.envs.camera import HAZARD, FastCamera, colours, network_input
+from lt_lib.envs.camera import FastCamera, colours, network_input
+from lt_lib.envs.materials import HAZARD
 from lt_lib.envs.reference import ReferenceCamera
 
 BATCH, SLOW_BATCH = 256, 32  # frames a turn: what a training asks for at a time, and fewer of the slow ones

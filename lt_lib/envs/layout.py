@@ -2,30 +2,26 @@
 
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
-from lt_lib.params import ROOT, Settings, UserError
+from lt_lib.params import Settings, UserError, layout_path
 
-FOLDER = ROOT / "params" / "layouts"
 LEFT, RIGHT = 0, 1
 SIDES = ("left", "right")
 OUTER_THICKNESS = 0.1  # metres
 
 
-def _ordered(value):
-    low, high = value
-    if not low < high:
-        raise ValueError(f"an interval needs low < high, got {list(value)}")
-    return float(low), float(high)
+def _ordered(interval: tuple[float, float]) -> tuple[float, float]:
+    if not interval[0] < interval[1]:
+        raise ValueError(f"an interval needs low < high, got {list(interval)}")
+    return interval
 
 
-Interval = Annotated[tuple[float, float], BeforeValidator(_ordered)]
-Jitter = Annotated[tuple[float, float, float], BeforeValidator(tuple)]
+Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
 
 
 class Rect(Settings):
@@ -52,7 +48,7 @@ class Rect(Settings):
 class Corridor(Settings):
     """Free rectangles cut out of the barrier, from the mouth on, and the slab that can block them."""
 
-    legs: Annotated[tuple[Rect, ...], BeforeValidator(tuple), Field(min_length=1)]
+    legs: Annotated[tuple[Rect, ...], Field(min_length=1)]
     slab: Rect
 
     def contains(self, x, y):
@@ -93,7 +89,7 @@ class Pose(Settings):
 class JitteredPose(Pose):
     """A pose drawn anew every episode, uniformly within +- jitter (metres, metres, degrees)."""
 
-    jitter: Jitter
+    jitter: tuple[float, float, float]
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """n poses, (n, 3) metres, metres, radians."""
@@ -129,7 +125,7 @@ class Layout(Settings):
     spawn: JitteredPose
     scout: JitteredPose
     goal: Goal
-    choice_points: Annotated[tuple[Pose, ...], BeforeValidator(tuple), Field(min_length=2)]
+    choice_points: Annotated[tuple[Pose, ...], Field(min_length=2)]
     communication_radius: PositiveFloat
 
     @property
@@ -214,10 +210,7 @@ def load_layout(name: str) -> Layout:
     Raises UserError, one line, for an unknown name or a scene that cannot be (a corridor narrower than the
     robot, a robot in a wall, a missing or unknown key).
     """
-    path = Path(name) if name.endswith(".yaml") else FOLDER / f"{name}.yaml"
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
-        raise UserError(f"unknown layout '{name}'; known: {known}, or the path of a .yaml file")
+    path = layout_path(name)
     try:
         return Layout(**yaml.safe_load(path.read_text()))
     except (yaml.YAMLError, TypeError) as error:

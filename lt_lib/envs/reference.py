@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lt_lib.envs.camera import GOAL_PILLAR, INDEX, MATERIALS
 from lt_lib.envs.layout import OUTER_THICKNESS, Box, Layout
+from lt_lib.envs.materials import GOAL_PILLAR, INDEX, MATERIALS
 from lt_lib.params import UserError
 
 FACE = 1e-3  # metres: walls are drawn as thin faces, one colour a direction

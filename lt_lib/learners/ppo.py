@@ -31,9 +31,9 @@ class Batch(NamedTuple):
 
     observations: Float[Tensor, "b d"]
     actions: Tensor  # (B,) categorical or (B, A) continuous
-    log_probs: Float[Tensor, "b"]
-    advantages: Float[Tensor, "b"]
-    returns: Float[Tensor, "b"]
+    log_probs: Float[Tensor, " b"]
+    advantages: Float[Tensor, " b"]
+    returns: Float[Tensor, " b"]
 
 
 class Statistics(NamedTuple):
@@ -93,6 +93,6 @@ def update(policy: Policy, optimiser: torch.optim.Optimizer, batch: Batch, confi
     return Statistics(*torch.stack(totals).mean(0).tolist())
 
 
-def clipped_surrogate(ratio: Float[Tensor, "b"], advantage: Float[Tensor, "b"], clip: float) -> Float[Tensor, "b"]:
+def clipped_surrogate(ratio: Float[Tensor, " b"], advantage: Float[Tensor, " b"], clip: float) -> Float[Tensor, " b"]:
     """min(ratio * A, clip(ratio, 1 - clip, 1 + clip) * A)."""
     return torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)

@@ -12,11 +12,20 @@ import numpy as np
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.messages import CONDITIONS
 from lt_lib.envs.layout import load_layout
-from lt_lib.learners.episodes import ROUTES, SLABS, roll_bank
+from lt_lib.learners.episodes import ROUTES, roll_bank
 from lt_lib.learners.executor import train_executor
 from lt_lib.learners.route import evaluate_head, train_head
 from lt_lib.params import (
-    ROOT, SECTIONS, BankConfig, EncoderConfig, EvaluationConfig, ExecutorConfig, GateConfig, Gates, HeadConfig, Training,
+    ROOT,
+    SECTIONS,
+    BankConfig,
+    EncoderConfig,
+    EvaluationConfig,
+    ExecutorConfig,
+    GateConfig,
+    Gates,
+    HeadConfig,
+    Training,
     UserError,
 )  # fmt: skip
 from lt_lib.perception.gates import measure_gates, require_gates
@@ -56,33 +65,38 @@ class Protocol:
         folder = ROOT / weights if weights else None
         return cls(RunStore(ROOT / "outputs" / "runs", workers), shards=shards, weights=folder, **configs)
 
-    def trained_encoder(self) -> Result:
-        """E and P as trained (or as found in `weights`), before any gate."""
+    def encoders(self) -> dict[str, Result]:
+        """Ours, and what the objective must beat at the gates: an untrained one, and one trained by prediction alone."""
+        alone = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
+        configs = {
+            "ours": self.encoder,
+            "untrained": self.encoder.model_copy(update={"epochs": 0.0}),
+            "prediction alone": self.encoder.model_copy(update=alone),
+        }
         if self.weights:
-            return load_frozen(self.weights, "encoder", load_layout(self.encoder.layout))
-        return self.store.fetch([Run(train_encoder, self.encoder, SEED)], "encoder")[0]
+            del configs["ours"]
+        trained = self.store.fetch([Run(train_encoder, config, SEED) for config in configs.values()], "encoders")
+        kept = {"ours": self._kept("encoder")} if self.weights else {}
+        return kept | dict(zip(configs, trained, strict=True))
+
+    def gate_reports(self, encoders: Mapping[str, Result]) -> dict[str, Result]:
+        """Probes and rank of checkpoints; see `perception.gates.Measured`."""
+        runs = [Run(measure_gates, self.probe, SEED, {"encoder": encoder}) for encoder in encoders.values()]
+        return dict(zip(encoders, self.store.fetch(runs, "freeze gates"), strict=True))
 
     def frozen_encoder(self) -> Result:
         """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
-        trained = self.trained_encoder()
-        require_gates(self.gate_report(trained), self.gates)
+        trained = self._kept("encoder") if self.weights else self.store.fetch([Run(train_encoder, self.encoder, SEED)], "encoder")[0]
+        require_gates(self.gate_reports({"ours": trained})["ours"], self.gates)
         return trained
 
-    def rivals(self) -> dict[str, Result]:
-        """What the objective must beat at the gates: the encoder before training, and trained by prediction alone."""
-        alone = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
-        configs = {"untrained": self.encoder.model_copy(update={"epochs": 0.0}), "prediction alone": self.encoder.model_copy(update=alone)}
-        runs = [Run(train_encoder, config, SEED) for config in configs.values()]
-        return dict(zip(configs, self.store.fetch(runs, "rival encoders"), strict=True))
-
-    def gate_report(self, encoder: Result) -> Result:
-        """Probes and rank of a checkpoint; see `perception.gates.Measured`."""
-        return self.store.fetch([Run(measure_gates, self.probe, SEED, {"encoder": encoder})], "freeze gates")[0]
+    def _kept(self, kind: str) -> Result:
+        return load_frozen(self.weights, kind, load_layout(self.encoder.layout))
 
     def frozen_executor(self, encoder: Result) -> Result:
         """The low-level controller, pretrained behind the frozen encoder."""
         if self.weights:
-            return load_frozen(self.weights, "executor", load_layout(self.executor.layout))
+            return self._kept("executor")
         return self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
 
     def save_executor(self, executor: Result, folder: Path) -> Path:

@@ -116,7 +116,7 @@ def evaluate(head: RouteHead, held_out: Bank, corruption: str, rng: np.random.Ge
     return played | {"route": route}
 
 
-def _played(outcomes: Outcomes, entry: Int[np.ndarray, "b"], slab: Int[np.ndarray, "b"], route: Int[np.ndarray, "b"]) -> dict[str, np.ndarray]:
+def _played(outcomes: Outcomes, entry: Int[np.ndarray, " b"], slab: Int[np.ndarray, " b"], route: Int[np.ndarray, " b"]) -> dict[str, np.ndarray]:
     """What became of episodes: optimal when the committed corridor is the slab-free one."""
     at = (entry, slab, route)
     return {

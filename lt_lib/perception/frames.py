@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from lt_lib.envs.arena import Arena
-from lt_lib.envs.camera import HAZARD, WALLS, FastCamera
+from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
+from lt_lib.envs.materials import HAZARD, WALLS
 
 HOLD = 0.9  # chance that a random action is kept for another step; otherwise it is drawn anew
 ARENAS = 640  # rollouts stepped side by side
@@ -44,7 +45,7 @@ def _rollouts(layout: Layout, n: int, length: int, rng: np.random.Generator) -> 
     return Rollouts(*(np.stack(part, axis=1) for part in (frames, actions, poses)))
 
 
-def free_poses(layout: Layout, slab: Int[np.ndarray, "n"], rng: np.random.Generator, apart_from=None) -> Float[np.ndarray, "n 3"]:
+def free_poses(layout: Layout, slab: Int[np.ndarray, " n"], rng: np.random.Generator, apart_from=None) -> Float[np.ndarray, "n 3"]:
     """Poses uniform over the free arena, clear of walls, of the slab and of other robots (n, 2 or 3)."""
     n, radius = len(slab), layout.robot.radius
     pose, missing = np.empty((n, 3)), np.ones(n, bool)

@@ -18,8 +18,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lt_lib.envs.camera import PALETTE, network_input
+from lt_lib.envs.camera import network_input
 from lt_lib.envs.layout import load_layout
+from lt_lib.envs.materials import PALETTE
 from lt_lib.params import EncoderConfig
 from lt_lib.perception.encoder import LATENT, Encoder, Predictor, best_device
 from lt_lib.perception.frames import random_rollouts
@@ -47,13 +48,13 @@ def covariance_loss(latent: Float[Tensor, "b d"]) -> Float[Tensor, ""]:
     return (covariance.square().sum() - covariance.diagonal().square().sum()) / latent.shape[1]
 
 
-def colour_classes() -> Int[np.ndarray, "colours"]:
+def colour_classes() -> Int[np.ndarray, " colours"]:
     """The class of each palette entry: its colour quantised to LEVELS a channel, equal codes sharing a class."""
     codes = PALETTE.astype(int) * LEVELS // 256 @ np.array([LEVELS**2, LEVELS, 1])
     return np.unique(codes, return_inverse=True)[1]
 
 
-def class_weights(classes: Int[np.ndarray, "..."], n: int) -> Float[Tensor, "n"]:
+def class_weights(classes: Int[np.ndarray, "..."], n: int) -> Float[Tensor, " n"]:
     """One over the square root of a class's share, scaled to a mean of 1 over the pixels; 0 for a class never seen."""
     share = np.bincount(classes.ravel(), minlength=n) / classes.size
     weights = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 1e-9)), 0)
@@ -63,7 +64,7 @@ def class_weights(classes: Int[np.ndarray, "..."], n: int) -> Float[Tensor, "n"]
 class Jepa(nn.Module):
     """E, P, the target copy of E and the auxiliary read-out, which is discarded at the freeze."""
 
-    def __init__(self, weights: Float[Tensor, "classes"]):
+    def __init__(self, weights: Float[Tensor, " classes"]):
         super().__init__()
         self.encoder, self.predictor = Encoder(), Predictor()
         self.target = deepcopy(self.encoder).requires_grad_(False)

@@ -26,7 +26,7 @@ def gate_table(reports: Mapping[str, Result], thresholds: Mapping[str, float]) -
 
 def training_frames(frames: UInt8[np.ndarray, "n h w"]) -> Figure:
     """Frames of random rollouts above, and below what the read-out is asked for: quantised colours on a coarse grid."""
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    figure = Figure(figsize=(12, 2.6), layout="constrained")
     panels = figure.subplots(2, len(frames))
     step = frames.shape[-1] // GRID
     classes = colour_classes()

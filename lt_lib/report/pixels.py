@@ -61,6 +61,11 @@ def table(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> pd
     return pd.DataFrame(rows).set_index("message content")
 
 
+def _wrapped(name: str) -> str:
+    """A condition's words on two lines."""
+    return CONDITIONS[name].words.replace(" (", "\n(").replace(", ", ",\n").replace("raw ", "raw\n")
+
+
 def routes(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> Figure:
     """Fig. 4: route optimality by message content; a dot a seed, a bar the mean, a diamond the paper's mean."""
     figure = Figure(figsize=(10, 4.8), layout="constrained")
@@ -72,9 +77,9 @@ def routes(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> F
         axes.plot(x + spread, shares, "o", color=colour, ms=7, mec="white", mew=0.8)
         axes.plot(x + 0.36, paper[f"px.{name.replace('_', '')}.route"].paper, "D", mfc="white", mec="black", ms=6)
     chance_line(axes)
-    axes.set_xticks(range(len(heads)), [CONDITIONS[name].words.replace(" (", "\n(").replace(", ", ",\n") for name in heads])
+    axes.set_xticks(range(len(heads)), [_wrapped(name) for name in heads], fontsize=9)
     axes.set(ylim=(0.0, 1.06), ylabel="route optimality\n(share of episodes in the slab-free corridor)")
-    axes.set_title("Only the message content differs; dot: a seed, bar: mean, hollow diamond: the paper's mean, dotted: chance")
+    axes.set_title("Only the message content differs. Dot: a seed; bar: our mean; hollow diamond: the paper's mean", fontsize=11)
     for role, colour in ROLES.items():
         axes.plot([], [], "o", color=colour, label=role)
     axes.legend(loc="lower left", ncols=3, fontsize=9)
@@ -92,12 +97,11 @@ def learning_curves(heads: Mapping[str, Sequence[Result]], batch: int) -> Figure
             chosen = np.array_split(head["optimal"], np.arange(batch, len(head["optimal"]), batch))
             upper.plot(episodes, [part.mean() for part in chosen], color=colour, lw=1, alpha=0.8)
             lower.semilogy(episodes, np.maximum(head["entropy"], 1e-7), color=colour, lw=1, alpha=0.8)
-        upper.set_title(CONDITIONS[name].words.replace(" (", "\n(").replace(", ", ",\n"), fontsize=9)
+        upper.set_title(_wrapped(name), fontsize=9)
         chance_line(upper)
         lower.axhline(np.log(2), color="black", ls="--", lw=0.8)
     panels[0, 0].set(ylabel="route optimality\nof a batch", ylim=(0.3, 1.03))
     panels[1, 0].set(ylabel="decision entropy (nats)\ndashed: uniform")
-    figure.supylabel("")
     for axes in panels[1]:
         axes.set_xlabel("episodes", fontsize=8)
     return figure

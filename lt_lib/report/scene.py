@@ -11,8 +11,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle, Wedge
 
-from lt_lib.envs.camera import HAZARD, MATERIALS, colours
+from lt_lib.envs.camera import colours
 from lt_lib.envs.layout import SIDES, Layout, Pose
+from lt_lib.envs.materials import HAZARD, MATERIALS
 from lt_lib.envs.occlusion import Occlusion, SightMap
 from lt_lib.envs.reference import ReferenceCamera, TopView
 
