@@ -23,12 +23,15 @@ from typing import Any, TextIO
 from lt_lib.files import writable_folder
 from lt_lib.manifest import write_manifest
 from lt_lib.params import ROOT, UserError, load_profile, notebook_defaults, notebook_names
+from lt_lib.preflight import check_inputs, settled
 from lt_lib.progress import Progress, read_progress
 
 # Without these the later notebook can only fail too; the scoreboard joins whatever is there.
 NEEDS = {"04_pixels": ("02_encoder",), "07_corruption": ("04_pixels",)}
 # What this script gives to every notebook, over what the profile says.
 GIVEN = ("profile", "outputs", "workers")
+# What names things that may not exist or not fit; checked before computing.
+INPUTS = ("layout", "weights", "seeds")
 CELL_LIMIT_S = 6 * 3600
 
 
@@ -84,12 +87,8 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="run_all.py", description="Executes the notebooks in order and says how each went.")
     parser.add_argument("--profile", default="full", help="a file of params/: full (default), quick or smoke")
-    parser.add_argument(
-        "--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels"
-    )
-    parser.add_argument(
-        "--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)"
-    )
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)")
     parser.add_argument("--outputs", type=Path, metavar="DIR", help="default: outputs/<profile>")
     parser.add_argument("--list", action="store_true", help="name the notebooks and stop")
     options = parser.parse_args(arguments)
@@ -109,7 +108,7 @@ def make_plan(options: argparse.Namespace, root: Path) -> Plan:
         root=root,
         profile=options.profile,
         outputs=Path(outputs or root / "outputs" / options.profile),
-        parameters={name: profile[name] | given for name in chosen},
+        parameters={name: settled(profile[name], root) | given for name in chosen},
     )
 
 
@@ -124,10 +123,16 @@ def choose(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
 
 def preflight(plan: Plan) -> None:
     """Everything that can be known to be wrong before computing. Raises UserError."""
-    for name in plan.parameters:
-        missing = set(GIVEN) - set(notebook_defaults(plan.root / "notebooks" / f"{name}.ipynb"))
+    checked: list[dict[str, Any]] = []
+    for name, given in plan.parameters.items():
+        declared = notebook_defaults(plan.root / "notebooks" / f"{name}.ipynb")
+        missing = set(GIVEN) - set(declared)
         if missing:
             raise UserError(f"{name}.ipynb: its parameters cell must declare {', '.join(sorted(missing))}")
+        inputs = {key: value for key, value in (declared | given).items() if key in INPUTS}
+        if inputs not in checked:  # notebooks share most of theirs
+            check_inputs(inputs, plan.root)
+            checked.append(inputs)
     for folder in (plan.outputs, plan.root / "outputs" / "runs"):
         writable_folder(folder)
 
@@ -139,12 +144,8 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
         failed = [need for need in NEEDS.get(name, ()) if need in outcomes and outcomes[need].status != "ok"]
         outcomes[name] = Outcome("skipped", 0.0, f"needs {failed[0]}") if failed else execute(plan, name)
         outcome = outcomes[name]
-        print(
-            f"{name:20}{outcome.status:8}{clock(outcome.seconds):>8}  {outcome.reason}".rstrip(), flush=True
-        )
-    entries = {
-        name: {"status": each.status, "seconds": round(each.seconds, 1)} for name, each in outcomes.items()
-    }
+        print(f"{name:20}{outcome.status:8}{clock(outcome.seconds):>8}  {outcome.reason}".rstrip(), flush=True)
+    entries = {name: {"status": each.status, "seconds": round(each.seconds, 1)} for name, each in outcomes.items()}
     write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, entries)
     if "09_scoreboard" in outcomes and outcomes["09_scoreboard"].status == "ok":
         print_summary(plan.outputs / "scoreboard.csv")
@@ -247,9 +248,7 @@ def describe(progress: Progress | None, seconds: float) -> str:
     if progress is None:
         return clock(seconds)
     left = "" if progress.left is None else f", about {clock(progress.left)} left"
-    return (
-        f"{clock(seconds)}  {progress.what} {progress.done}/{progress.total} ({progress.fraction:.0%}){left}"
-    )
+    return f"{clock(seconds)}  {progress.what} {progress.done}/{progress.total} ({progress.fraction:.0%}){left}"
 
 
 def clock(seconds: float) -> str:

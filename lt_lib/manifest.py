@@ -55,9 +55,7 @@ def git_state(root: Path) -> dict[str, Any]:
 def machine() -> dict[str, Any]:
     """Processor, cores that we may use, and memory in GiB."""
     info = Path("/proc/cpuinfo")
-    models = re.findall(
-        r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", flags=re.MULTILINE
-    )
+    models = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", flags=re.MULTILINE)
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "cpu": models[0] if models else platform.processor(),

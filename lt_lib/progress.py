@@ -69,11 +69,7 @@ class Progress:
 
 def read_progress(folder: Path, since: float) -> Progress | None:
     """The fetch in a store that was last to start, if it was at or after `since` (seconds of the epoch)."""
-    stages = [
-        (told["started"], path, told)
-        for path in folder.glob("inflight/*/stage.json")
-        if (told := _read(path))
-    ]
+    stages = [(told["started"], path, told) for path in folder.glob("inflight/*/stage.json") if (told := _read(path))]
     started, path, told = max(stages, default=(0.0, None, None), key=lambda stage: stage[0])
     if path is None or started < since:
         return None

@@ -62,9 +62,7 @@ class Run:
 
     def __post_init__(self) -> None:
         if self.function.__module__ == "__main__" or "." in self.function.__qualname__:
-            raise ValueError(
-                f"{self.function.__qualname__} must be a module's own function for workers to import it"
-            )
+            raise ValueError(f"{self.function.__qualname__} must be a module's own function for workers to import it")
 
     def key(self) -> str:
         """sha256 of all that the result depends on: call, contents of inputs, source, library versions."""
@@ -74,9 +72,7 @@ class Run:
             "function": f"{self.function.__module__}.{self.function.__qualname__}",
             "config": self.config.model_dump(mode="json"),
             "seed": self.seed,
-            "inputs": {
-                name: hashlib.sha256(pack(result)).hexdigest() for name, result in self.inputs.items()
-            },
+            "inputs": {name: hashlib.sha256(pack(result)).hexdigest() for name, result in self.inputs.items()},
             "source": source_digest(self.function, type(self.config), folder=folder),
             "libraries": library_versions(),
         }
@@ -136,9 +132,7 @@ class RunStore:
         failures = []
         with stage(self.folder, what, len(missing)) as (progress, finished), _workers(processes) as pool:
             futures = {
-                pool.submit(
-                    _compute_run, run, key, self._path(key, run), journal, progress / f"{key}.json"
-                ): key
+                pool.submit(_compute_run, run, key, self._path(key, run), journal, progress / f"{key}.json"): key
                 for key, run in missing.items()
             }
             for future in as_completed(futures):

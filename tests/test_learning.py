@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from lt_lib.comm.channel import CORRUPTIONS, deliver
 from lt_lib.comm.messages import CONTENTS, Sender
@@ -14,7 +15,7 @@ from lt_lib.learners import ppo
 from lt_lib.learners.episodes import Draws, draw_scenes, drive, roll_bank
 from lt_lib.learners.executor import Executor, FrozenExecutor
 from lt_lib.learners.route import train_head
-from lt_lib.params import BankConfig, HeadConfig, PpoConfig
+from lt_lib.params import BankConfig, HeadConfig, PpoConfig, layout_path
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.perception.jepa import Jepa, class_weights, colour_classes, covariance_loss, variance_loss
 
@@ -75,7 +76,13 @@ def test_update_survives_a_leftover_minibatch_of_one_and_a_constant_advantage():
     head = RouteHead(66)
     optimiser = torch.optim.Adam(head.parameters(), lr=1e-3)
     n = 65
-    batch = ppo.Batch(torch.randn(n, 66), torch.zeros(n, dtype=torch.long), torch.full((n,), -0.69), torch.ones(n), torch.ones(n))
+    batch = ppo.Batch(
+        torch.randn(n, 66),
+        torch.zeros(n, dtype=torch.long),
+        torch.full((n,), -0.69),
+        torch.ones(n),
+        torch.ones(n),
+    )
     statistics = ppo.update(head, optimiser, batch, PpoConfig(), minibatch=64, rng=np.random.default_rng(0))
     assert all(np.isfinite(statistics)) and all(p.isfinite().all() for p in head.parameters())
 
@@ -166,18 +173,21 @@ def test_corruptions_do_what_their_names_say():
     torch.testing.assert_close(noise.std(0), wire[:, 2:].std(0), rtol=0.06, atol=0)
 
 
-def test_bank_equals_live_episodes_whatever_runs_beside_them(encoder, executor):
-    config = BankConfig(entries=5, envs=8)
-    bank = roll_bank(config, 0, report=quiet, encoder=encoder, executor=executor)
-    draws = Draws(bank["spawn"], bank["scout"])
-    entry, slab, route = (axis.ravel()[::-1] for axis in np.indices((5, 2, 2)))  # another order, other neighbours
+def test_bank_equals_live_episodes_whatever_runs_beside_them(encoder, executor, tmp_path):
+    near = yaml.safe_load(layout_path("default").read_text()) | {"goal": {"x": -1.9, "y": 0.2, "radius": 0.3}}
+    path = tmp_path / "near.yaml"  # a goal that some episodes reach soon
+    path.write_text(yaml.safe_dump(near))
+    bank = roll_bank(
+        BankConfig(layout=str(path), entries=4, envs=6), 0, report=quiet, encoder=encoder, executor=executor
+    )
+    entry, slab, route = (axis.ravel()[::-1] for axis in np.indices((4, 2, 2)))  # another order, other neighbours
     live = drive(
-        LAYOUT, FrozenEncoder(encoder), FrozenExecutor(executor), Draws(draws.spawn[entry], draws.scout[entry]),
-        slab, route, envs=8, commit_step=2,
+        load_layout(str(path)), FrozenEncoder(encoder), FrozenExecutor(executor),
+        Draws(bank["spawn"][entry], bank["scout"][entry]), slab, route, envs=6, commit_step=2,
     )  # fmt: skip
     for name, values in live._asdict().items():
         np.testing.assert_array_equal(bank[name][entry, slab, route], values)
-    assert len(np.unique(live.length)) > 1 or live.contacts.any()  # something happened
+    assert live.success.any() and len(np.unique(live.length)) > 2  # slots were filled again at different times
 
 
 def ideal_bank(n: int) -> dict[str, np.ndarray]:
@@ -189,7 +199,9 @@ def ideal_bank(n: int) -> dict[str, np.ndarray]:
     return draws._asdict() | {"success": free, "length": length, "contacts": contacts, "entered": route}
 
 
-@pytest.mark.parametrize(("content", "low", "high"), [("oracle", 0.95, 1.0), ("floor", 0.4, 0.6), ("position", 0.4, 0.6)])
+@pytest.mark.parametrize(
+    ("content", "low", "high"), [("oracle", 0.95, 1.0), ("floor", 0.4, 0.6), ("position", 0.4, 0.6)]
+)
 def test_a_head_learns_from_reward_alone_what_its_message_tells_and_no_more(content, low, high, encoder):
     result = train_head(HeadConfig(content=content), 0, report=quiet, bank=ideal_bank(256), encoder=encoder)
     assert low <= result["optimal"][-1000:].mean() <= high

@@ -272,9 +272,7 @@ def write_encoder(outputs, claims, value=0.91, profile="full"):
 def write_pixels(outputs, claims, profile="full"):
     pixels = Findings("04_pixels", outputs, profile, claims)
     seeds = np.array([1.0, 0.5, 0.6], dtype=np.float32)
-    pixels.add(
-        "px.latent.route", seeds.mean(), seeds=seeds, low=0.3, high=1.0, test="rank", p=0.5, holds=False
-    )
+    pixels.add("px.latent.route", seeds.mean(), seeds=seeds, low=0.3, high=1.0, test="rank", p=0.5, holds=False)
     pixels.add("px.range", [np.float64(0.97), 1], low=np.array([0.96, 0.99]), high=[0.98, 1.0], n=np.int64(3))
     pixels.add("px.words", "monotone")
     pixels.add("px.test", 42.0, holds=np.bool_(True))
@@ -464,9 +462,7 @@ def test_written_board_reads_back(tmp_path, few):
     assert (rows[1]["p"], rows[6]["ours"]) == ("0.5", "")
     text = (tmp_path / "scoreboard.md").read_text()
     assert "**3 reproduced, 1 same direction, 2 not reproduced, 1 not run, of 7**" in text
-    assert (
-        "| e.probe | probe \\| accuracy | 0.9 | 0.8 [0.79, 0.81] | ≈ same direction | tried harder |" in text
-    )
+    assert "| e.probe | probe \\| accuracy | 0.9 | 0.8 [0.79, 0.81] | ≈ same direction | tried harder |" in text
     assert "| px.range | range | measured | 0.98, 1 | 0.97, 1 [0.96, 0.99, 0.98, 1] | 3 |" in text
     assert text.index("## Not as in the paper") < text.index("## 02_encoder") < text.index("## 04_pixels")
     assert "profile" not in text
@@ -509,9 +505,7 @@ def test_picture_shows_every_measured_number(tmp_path, few):
     assert sorted(float(line.get_xdata()[0]) for line in marks) == [0.9, 0.98, 0.997, 1.0]
     colours = {line.get_marker(): line.get_color() for line in fig.axes[0].lines}
     assert colours["^"] == scoreboard.MARKS[SAME].colour
-    assert [line.get_xdata()[0] for line in fig.axes[1].lines if line.get_marker() == ">"] == [
-        forest.WIDEST
-    ] * 2
+    assert [line.get_xdata()[0] for line in fig.axes[1].lines if line.get_marker() == ">"] == [forest.WIDEST] * 2
     assert [text.get_text() for text in fig.texts] == [fig.get_suptitle()]
 
 

@@ -22,7 +22,7 @@ from run_all import choose, clock, describe, main
 PARAMETERS = """profile = "smoke"
 outputs = ""
 workers = 0
-seeds = 2
+count = 2
 share = 0.5
 content = "latent"
 sizes = [1, 2]
@@ -33,7 +33,7 @@ from pathlib import Path
 from toy_runs import ToyConfig, train_toy
 from lt_lib.runs import Run, RunStore
 store = RunStore(Path("outputs/runs"), workers)
-results = store.fetch([Run(train_toy, ToyConfig(**toy), seed) for seed in range(seeds)], "toys")"""
+results = store.fetch([Run(train_toy, ToyConfig(**toy), seed) for seed in range(count)], "toys")"""
 
 WRITE = """path = Path(outputs or f"outputs/{profile}") / "results" / "NAME.json"
 path.parent.mkdir(exist_ok=True)
@@ -58,7 +58,7 @@ def project(tmp_path, monkeypatch):
         (root / folder).mkdir(parents=True)
     for name in ("02_encoder", "03_gridworld"):
         write_notebook(root, name, COMPUTE, WRITE)
-    (root / "params" / "smoke.yaml").write_text("shared: {seeds: 2}\n02_encoder: {toy: {size: 5}}\n")
+    (root / "params" / "smoke.yaml").write_text("shared: {count: 2}\n02_encoder: {toy: {size: 5}}\n")
     (root / "params" / "claims.yaml").write_text("")
     (root / "requirements.txt").write_text("numpy==2\n")
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{ROOT / 'tests'}")
@@ -83,9 +83,9 @@ def losses(root: Path, name: str) -> list[float]:
         ("04_pixel: {}", "smoke.yaml: unknown notebook '04_pixel'; there are 02_encoder, 03_gridworld"),
         ("shared: {seed: 2}", "smoke.yaml: shared: no notebook declares 'seed'; there are content, "),
         ("02_encoder: {seed: 2}", "smoke.yaml: 02_encoder: unknown parameter 'seed'; there are content, "),
-        ("02_encoder: {seeds: '2'}", "smoke.yaml: 02_encoder: seeds: expected int such as 2, got '2'"),
-        ("02_encoder: {seeds: true}", "smoke.yaml: 02_encoder: seeds: expected int such as 2, got True"),
-        ("02_encoder: {seeds: 2.0}", "smoke.yaml: 02_encoder: seeds: expected int such as 2, got 2.0"),
+        ("02_encoder: {count: '2'}", "smoke.yaml: 02_encoder: count: expected int such as 2, got '2'"),
+        ("02_encoder: {count: true}", "smoke.yaml: 02_encoder: count: expected int such as 2, got True"),
+        ("02_encoder: {count: 2.0}", "smoke.yaml: 02_encoder: count: expected int such as 2, got 2.0"),
         ("shared: {share: 3e-4}", "smoke.yaml: 02_encoder: share: expected float such as 0.5, got '3e-4'"),
         ("02_encoder: {content: 3}", "smoke.yaml: 02_encoder: content: expected str such as 'latent', got 3"),
         (
@@ -104,7 +104,7 @@ def losses(root: Path, name: str) -> list[float]:
         ("02_encoder: 3", "smoke.yaml: 02_encoder: expected its parameters "),
         ("- 3", "smoke.yaml: expected sections such as 'shared:', got [3]"),
         ("02_encoder: {toy: [", "smoke.yaml: not valid yaml: "),
-        ("02_encoder: {}\n02_encoder: {seeds: 3}", "smoke.yaml: not valid yaml: '02_encoder' is given twice"),
+        ("02_encoder: {}\n02_encoder: {count: 3}", "smoke.yaml: not valid yaml: '02_encoder' is given twice"),
     ],
 )
 def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml, complaint):
@@ -137,10 +137,10 @@ def test_a_bad_option_is_one_line_and_nothing_is_computed(project, capfd, monkey
     ("parameters", "complaint"),
     [
         (
-            "seeds = 2\ntoy = {}",
+            "count = 2\ntoy = {}",
             "02_encoder.ipynb: its parameters cell must declare outputs, profile, workers",
         ),
-        ("seeds = 1 + 1", "02_encoder.ipynb: its parameters cell may hold only name = literal"),
+        ("count = 1 + 1", "02_encoder.ipynb: its parameters cell may hold only name = literal"),
         ("import os", "02_encoder.ipynb: its parameters cell may hold only name = literal"),
     ],
 )
@@ -170,10 +170,10 @@ def assert_refused(root: Path, capfd, arguments: list[str], complaint: str) -> N
 
 def test_a_profile_gives_shared_values_where_declared_and_the_notebooks_own_over_them(project):
     write_notebook(project, "04_pixels", parameters="share = 0.5\nother = 1")
-    (project / "params" / "smoke.yaml").write_text("shared: {seeds: 3, share: 1}\n03_gridworld: {seeds: 4}\n")
+    (project / "params" / "smoke.yaml").write_text("shared: {count: 3, share: 1}\n03_gridworld: {count: 4}\n")
     assert load_profile("smoke", project) == {
-        "02_encoder": {"seeds": 3, "share": 1},
-        "03_gridworld": {"seeds": 4, "share": 1},
+        "02_encoder": {"count": 3, "share": 1},
+        "03_gridworld": {"count": 4, "share": 1},
         "04_pixels": {"share": 1},
     }
 
@@ -261,9 +261,7 @@ def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd)
 def test_a_scoreboard_is_summed_up_in_the_last_line(project, capfd):
     rows = r"id,verdict\na,reproduced\nb,not run\nc,reproduced"
     table = f'Path("outputs/smoke/scoreboard.csv").write_text("{rows}")'
-    write_notebook(
-        project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, WRITE
-    )
+    write_notebook(project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, WRITE)
     assert smoke(project, "--only", "09") == 0
     assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: 2 reproduced, 1 not run"
 
@@ -285,9 +283,7 @@ def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(proje
     assert smoke(project) == 1
     lines = {line.split()[0]: line for line in capfd.readouterr().out.splitlines() if "toys" not in line}
     assert "FAILED" in lines["02_encoder"]
-    assert lines["02_encoder"].endswith(
-        "cell 3: ValueError: the gate (log: outputs/smoke/logs/02_encoder.log)"
-    )
+    assert lines["02_encoder"].endswith("cell 3: ValueError: the gate (log: outputs/smoke/logs/02_encoder.log)")
     assert "ValueError: the gate" in (project / "outputs" / "smoke" / "logs" / "02_encoder.log").read_text()
     assert "ended without writing outputs/smoke/results/03_gridworld.json" in lines["03_gridworld"]
     assert "skipped" in lines["04_pixels"]
@@ -303,9 +299,7 @@ def test_a_lost_kernel_is_a_failed_notebook(project, capfd):
     assert "FAILED" in capfd.readouterr().out
 
 
-def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_writes_where_told(
-    project, tmp_path
-):
+def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_writes_where_told(project, tmp_path):
     for only in ("02", "gridworld"):
         assert smoke(project, "--only", only, "--outputs", str(tmp_path / "elsewhere")) == 0
     manifest = json.loads((tmp_path / "elsewhere" / "manifest.json").read_text())
@@ -321,7 +315,7 @@ START = "import sys, pathlib, run_all; sys.exit(run_all.main(sys.argv[2:], pathl
 def start(root: Path) -> subprocess.Popen:
     """run_all in a process of its own, on notebook 02 with runs of 1.5 seconds, one at a time."""
     # The process has no settings for 'toy', so the notebook has it by default.
-    parameters = PARAMETERS.replace("toy = {}", "toy = {'seconds': 1.5}").replace("seeds = 2", "seeds = 3")
+    parameters = PARAMETERS.replace("toy = {}", "toy = {'seconds': 1.5}").replace("count = 2", "count = 3")
     write_notebook(root, "02_encoder", COMPUTE, WRITE, parameters=parameters)
     (root / "params" / "smoke.yaml").write_text("")
     command = [sys.executable, "-c", START, str(root), "--profile", "smoke", "--only", "02", "--workers", "1"]

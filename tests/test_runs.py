@@ -85,9 +85,7 @@ def test_key_follows_function_config_seed_and_the_contents_of_inputs():
         Run(train_toy, ToyConfig(), 0, {"start": {"weights": np.ones((4, 3))}}),
     ]
     assert len({run.key() for run in runs}) == len(runs)
-    assert (
-        Run(train_toy, ToyConfig(size=4), 0, {"start": {"weights": np.zeros((4, 3))}}).key() == runs[4].key()
-    )
+    assert Run(train_toy, ToyConfig(size=4), 0, {"start": {"weights": np.zeros((4, 3))}}).key() == runs[4].key()
 
 
 def test_key_follows_what_settings_compute_and_its_name_in_errors_does_not(tmp_path):
@@ -131,8 +129,7 @@ LAB = {
     "lab/lazy.py": "import numpy\n",
     "lab/unrelated.py": "from lab import train\n",
     "lt_lib/__init__.py": "",
-    "lt_lib/params.py": "class Base: pass\n"
-    "class TrainConfig(Base): size = 1\nclass OtherConfig(Base): size = 1\n",
+    "lt_lib/params.py": "class Base: pass\nclass TrainConfig(Base): size = 1\nclass OtherConfig(Base): size = 1\n",
 }
 
 
@@ -230,9 +227,7 @@ def test_a_damaged_file_is_named_and_computed_again(finished, caplog, damage):
 
 def test_a_failing_run_is_named_and_the_others_are_kept(tmp_path):
     bad = Run(train_toy, ToyConfig(size=2, fails=True), 7)
-    with pytest.raises(
-        RunError, match=r"1 of 3 .*train_toy\(seed=7, size=2, fails=True\): ValueError: this seed"
-    ):
+    with pytest.raises(RunError, match=r"1 of 3 .*train_toy\(seed=7, size=2, fails=True\): ValueError: this seed"):
         RunStore(tmp_path, workers=1).fetch([bad, *toys(2)], "toys")
     assert sorted(journal_keys(tmp_path)) == sorted(run.key() for run in toys(2))
 

@@ -18,7 +18,12 @@ def anchor(sender: Float[np.ndarray, "b 2"], receiver: Float[np.ndarray, "b 2"],
     return torch.from_numpy((sender - receiver) / radius).float()
 
 
-def deliver(content: Float[Tensor, "b c"], sender: Float[np.ndarray, "b 2"], receiver: Float[np.ndarray, "b 2"], radius: float) -> Float[Tensor, "b w"]:
+def deliver(
+    content: Float[Tensor, "b c"],
+    sender: Float[np.ndarray, "b 2"],
+    receiver: Float[np.ndarray, "b 2"],
+    radius: float,
+) -> Float[Tensor, "b w"]:
     """The wire (b, 2 + c) as it reaches the receiver; all zeros from a sender farther away than `radius` metres."""
     offset = anchor(sender, receiver, radius)
     in_range = offset.norm(dim=1, keepdim=True) <= 1

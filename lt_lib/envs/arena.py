@@ -19,7 +19,11 @@ HORIZON = 600  # control steps
 CONTACT = 0.005  # metres: nearer than this counts as touching
 NO_CORRIDOR = -1
 
-MASS, GAIN, FORCE = 1.0, 100.0, 20.0  # kg, N s/m, N: full speed within three physics steps, no push through a wall
+MASS, GAIN, FORCE = (
+    1.0,
+    100.0,
+    20.0,
+)  # kg, N s/m, N: full speed within three physics steps, no push through a wall
 
 
 class Arena:
@@ -47,7 +51,13 @@ class Arena:
     def pose(self) -> Float[np.ndarray, "n 3"]:
         return self._qpos.copy()
 
-    def reset(self, which: Bool[np.ndarray, " n"], pose: Float[np.ndarray, "n 3"], slab: Int[np.ndarray, " n"], scout: Float[np.ndarray, "n 3"]):
+    def reset(
+        self,
+        which: Bool[np.ndarray, " n"],
+        pose: Float[np.ndarray, "n 3"],
+        slab: Int[np.ndarray, " n"],
+        scout: Float[np.ndarray, "n 3"],
+    ):
         """Starts new episodes in the scenes of `which`: navigator and scout poses, blocked corridor (0 left, 1 right)."""
         self._qpos[which], self._qvel[which], self._warm[which] = pose[which], 0.0, 0.0
         self.slab[which], self.scout[which] = slab[which], scout[which]

@@ -28,7 +28,9 @@ class FastCamera:
         self._goal = np.array([layout.goal.x, layout.goal.y, *GOAL_PILLAR], np.float32)
         self._robot = np.array([layout.robot.radius, layout.robot.height], np.float32)
 
-    def frames(self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]) -> UInt8[np.ndarray, "b h w"]:
+    def frames(
+        self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
+    ) -> UInt8[np.ndarray, "b h w"]:
         """Palette indices of what is seen.
 
         eyes    (B, 3) metres, metres, radians: the camera's pose
@@ -37,9 +39,19 @@ class FastCamera:
         """
         out = np.empty((len(eyes), self.pixels, self.pixels), np.uint8)
         draw(
-            eyes.astype(np.float64), np.asarray(slabs).astype(np.int64), others.astype(np.float32), self._eye_height,
-            self._tan, self._walls, self._wall_index, self._wall_height, self._slabs, self._slab_height,
-            self._goal, self._robot, out,
+            eyes.astype(np.float64),
+            np.asarray(slabs).astype(np.int64),
+            others.astype(np.float32),
+            self._eye_height,
+            self._tan,
+            self._walls,
+            self._wall_index,
+            self._wall_height,
+            self._slabs,
+            self._slab_height,
+            self._goal,
+            self._robot,
+            out,
         )
         return out
 
@@ -49,7 +61,9 @@ def colours(frames: UInt8[np.ndarray, "*batch h w"], palette: UInt8[np.ndarray, 
     return palette[frames]
 
 
-def network_input(frames: UInt8[np.ndarray, "b h w"], palette: UInt8[np.ndarray, "colours 3"] = PALETTE) -> Float[np.ndarray, "b h w 3"]:
+def network_input(
+    frames: UInt8[np.ndarray, "b h w"], palette: UInt8[np.ndarray, "colours 3"] = PALETTE
+) -> Float[np.ndarray, "b h w 3"]:
     """Colours over 255, (B, H, W, 3) float32: the input scaling of the encoder and of the raw message."""
     out = np.empty((*frames.shape, 3), np.float32)
     red, green, blue = np.ascontiguousarray(palette.T, np.float32) / np.float32(255)

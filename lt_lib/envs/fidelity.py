@@ -22,7 +22,13 @@ class Agreement(NamedTuple):
     frames: int
 
 
-def agreement(fast: FastCamera, reference: ReferenceCamera, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]) -> Agreement:
+def agreement(
+    fast: FastCamera,
+    reference: ReferenceCamera,
+    eyes: Float[np.ndarray, "b 3"],
+    slabs,
+    others: Float[np.ndarray, "b 2"],
+) -> Agreement:
     """Compares with MuJoCo's segmentation and with its colours; arguments as for `FastCamera.frames`."""
     ours, theirs = (camera.frames(eyes, slabs, others) for camera in (fast, reference))
     same = ours == theirs
@@ -31,7 +37,14 @@ def agreement(fast: FastCamera, reference: ReferenceCamera, eyes: Float[np.ndarr
     return Agreement(float(same.mean()), float(flags.mean()), int(apart[same].max()), len(eyes))
 
 
-def frame_rates(fast: FastCamera, reference: ReferenceCamera, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"], rounds: int = 5) -> dict[str, float]:
+def frame_rates(
+    fast: FastCamera,
+    reference: ReferenceCamera,
+    eyes: Float[np.ndarray, "b 3"],
+    slabs,
+    others: Float[np.ndarray, "b 2"],
+    rounds: int = 5,
+) -> dict[str, float]:
     """Frames a second of processor time, the median over rounds in which the cameras take turns.
 
     Processor time counts all threads of this process, so these are the rates of one core; a renderer on a GPU

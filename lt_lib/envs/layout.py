@@ -136,7 +136,12 @@ class Layout(Settings):
     def walls(self) -> tuple[Box, ...]:
         """The four outer walls and what is left of the barrier once the corridors are cut out."""
         (x0, x1), (y0, y1), t = self.arena.x, self.arena.y, OUTER_THICKNESS
-        outer = [(x0 - t, x0, y0 - t, y1 + t), (x1, x1 + t, y0 - t, y1 + t), (x0, x1, y0 - t, y0), (x0, x1, y1, y1 + t)]
+        outer = [
+            (x0 - t, x0, y0 - t, y1 + t),
+            (x1, x1 + t, y0 - t, y1 + t),
+            (x0, x1, y0 - t, y0),
+            (x0, x1, y1, y1 + t),
+        ]
         return (
             *(Box(b, self.wall_height, "wall") for b in outer),
             *(Box(b, self.wall_height, "barrier") for b in self._barrier_blocks()),
@@ -218,4 +223,6 @@ def load_layout(name: str) -> Layout:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise UserError(f"layout {path.name}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}") from error
+        raise UserError(
+            f"layout {path.name}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}"
+        ) from error

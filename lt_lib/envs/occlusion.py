@@ -33,7 +33,9 @@ class SightMap(NamedTuple):
     pixels: Float[np.ndarray, "x y"]
 
 
-def hazard_pixels(camera, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]) -> Int[np.ndarray, " b"]:
+def hazard_pixels(
+    camera, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
+) -> Int[np.ndarray, " b"]:
     """Hazard pixels in each frame; arguments as for `FastCamera.frames`, of which `camera` has to have the call."""
     frames = camera.frames(eyes, slabs, others)
     return ((frames >= SLAB[0]) & (frames <= SLAB[-1])).sum(axis=(1, 2))  # far faster than looking up HAZARD

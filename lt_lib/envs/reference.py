@@ -25,14 +25,18 @@ class ReferenceCamera:
         materials = [name.split(":")[0] for name in _geom_names(self.model)]
         self._index = np.array([INDEX.get(name, INDEX["sky"]) for name in materials] + [INDEX["sky"]], np.uint8)
 
-    def frames(self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]) -> UInt8[np.ndarray, "b h w"]:
+    def frames(
+        self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
+    ) -> UInt8[np.ndarray, "b h w"]:
         """Palette indices by MuJoCo's segmentation; arguments as for `FastCamera.frames`."""
         self._renderer.enable_segmentation_rendering()
         frames = self._each(eyes, slabs, others)
         self._renderer.disable_segmentation_rendering()
         return self._index[frames[..., 0]]  # geom id; background is -1, the last entry
 
-    def pictures(self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]) -> UInt8[np.ndarray, "b h w 3"]:
+    def pictures(
+        self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
+    ) -> UInt8[np.ndarray, "b h w 3"]:
         """The rendered colours, RGB."""
         return self._each(eyes, slabs, others)
 
@@ -103,7 +107,7 @@ def scene_xml(layout: Layout, pixels: int) -> str:
     <global offwidth="{max(pixels, 64)}" offheight="{max(pixels, 64)}"/>
     <headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/>
   </visual>
-  <asset><texture type="skybox" builtin="flat" rgb1="{_rgb('sky')}" width="8" height="48"/></asset>
+  <asset><texture type="skybox" builtin="flat" rgb1="{_rgb("sky")}" width="8" height="48"/></asset>
   <worldbody>
     <camera name="above" projection="orthographic" pos="{(x0 + x1) / 2} {(y0 + y1) / 2} {2 * layout.wall_height}"
             fovy="{y1 - y0 + 2 * OUTER_THICKNESS}"/>
@@ -137,7 +141,12 @@ def _rgba(material: str) -> str:
 def _faces(name, box: Box) -> str:
     """Four thin faces whose outer sides are the box's sides."""
     (x0, x1, y0, y1), h, out = box.bounds, box.height / 2, ""
-    for axis, at, across in (("x", x0 + FACE / 2, 0), ("x", x1 - FACE / 2, 1), ("y", y0 + FACE / 2, 2), ("y", y1 - FACE / 2, 3)):
+    for axis, at, across in (
+        ("x", x0 + FACE / 2, 0),
+        ("x", x1 - FACE / 2, 1),
+        ("y", y0 + FACE / 2, 2),
+        ("y", y1 - FACE / 2, 3),
+    ):
         along_x = axis == "x"
         pos = (at, (y0 + y1) / 2, h) if along_x else ((x0 + x1) / 2, at, h)
         size = (FACE / 2, (y1 - y0) / 2, h) if along_x else ((x1 - x0) / 2 - FACE, FACE / 2, h)

@@ -47,7 +47,17 @@ def draw_scenes(layout: Layout, n: int, rng: np.random.Generator) -> Draws:
     return Draws(layout.spawn.sample(n, rng), layout.scout.sample(n, rng))
 
 
-def drive(layout: Layout, encoder: FrozenEncoder, executor: FrozenExecutor, draws: Draws, slab, route, envs: int, commit_step: int, report: Callable[[float], None] = lambda _: None) -> Outcomes:
+def drive(
+    layout: Layout,
+    encoder: FrozenEncoder,
+    executor: FrozenExecutor,
+    draws: Draws,
+    slab,
+    route,
+    envs: int,
+    commit_step: int,
+    report: Callable[[float], None] = lambda _: None,
+) -> Outcomes:
     """Drives E episodes, `envs` at a time, each from its draw to the goal or the time-out.
 
     slab, route  (E,) 0 left, 1 right: the blocked corridor and the commanded one
@@ -60,7 +70,12 @@ def drive(layout: Layout, encoder: FrozenEncoder, executor: FrozenExecutor, draw
     episode = np.arange(envs) % total  # which episode a row plays; rows to spare replay one and are not recorded
     following, finished = min(envs, total), 0
     live, age = np.arange(envs) < total, np.zeros(envs, np.int64)
-    outcome = Outcomes(np.zeros(total, bool), np.zeros(total, np.int64), np.zeros(total, np.int64), np.full(total, NO_CORRIDOR))
+    outcome = Outcomes(
+        np.zeros(total, bool),
+        np.zeros(total, np.int64),
+        np.zeros(total, np.int64),
+        np.full(total, NO_CORRIDOR),
+    )
     arena.reset(np.ones(envs, bool), draws.spawn[episode], slab[episode], draws.scout[episode])
     while finished < total:
         latent = encoder.latent(camera.frames(arena.pose, arena.slab, arena.scout[:, :2]))
@@ -88,14 +103,28 @@ def _record(outcome: Outcomes, episode, arena: Arena, live):
     outcome.entered[episode[first]] = arena.corridor[live][first]
 
 
-def roll_bank(config: BankConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray], executor: Mapping[str, np.ndarray]) -> dict:
+def roll_bank(
+    config: BankConfig,
+    seed: int,
+    *,
+    report: Callable[[float], None],
+    encoder: Mapping[str, np.ndarray],
+    executor: Mapping[str, np.ndarray],
+) -> dict:
     """Every outcome of `entries` draws of the scene: arrays (entries, slab, route), and the draws (entries, 3)."""
     layout, device = load_layout(config.layout), best_device(config.device)
     draws = draw_scenes(layout, config.entries, np.random.default_rng([seed, 2]))
     shape = (config.entries, SLABS, ROUTES)
     entry, slab, route = (axis.ravel() for axis in np.indices(shape))
     outcome = drive(
-        layout, FrozenEncoder(encoder, device, config.precision), FrozenExecutor(executor, device),
-        Draws(draws.spawn[entry], draws.scout[entry]), slab, route, config.envs, config.commit_step, report,
+        layout,
+        FrozenEncoder(encoder, device, config.precision),
+        FrozenExecutor(executor, device),
+        Draws(draws.spawn[entry], draws.scout[entry]),
+        slab,
+        route,
+        config.envs,
+        config.commit_step,
+        report,
     )
     return draws._asdict() | {name: values.reshape(shape) for name, values in outcome._asdict().items()}

@@ -25,7 +25,12 @@ ROUTES = 2
 HIDDEN = 128
 FROM_SPAWN = 0.5  # share of pretraining episodes that start at the spawn
 TIME_LIMIT = 300  # control steps of a pretraining episode; a time-out is bootstrapped, not punished
-ENTERED, DISOBEYED, ARRIVED, BLOCKED = 2.0, -5.0, 5.0, 5.0  # rewards; BLOCKED is reaching a commanded corridor's slab
+ENTERED, DISOBEYED, ARRIVED, BLOCKED = (
+    2.0,
+    -5.0,
+    5.0,
+    5.0,
+)  # rewards; BLOCKED is reaching a commanded corridor's slab
 
 
 class Executor(nn.Module):
@@ -42,7 +47,13 @@ class Executor(nn.Module):
 
 
 def _mlp(outputs: int, gain: float) -> nn.Sequential:
-    layers = [nn.Linear(LATENT + ROUTES, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, outputs)]
+    layers = [
+        nn.Linear(LATENT + ROUTES, HIDDEN),
+        nn.Tanh(),
+        nn.Linear(HIDDEN, HIDDEN),
+        nn.Tanh(),
+        nn.Linear(HIDDEN, outputs),
+    ]
     for layer, scale in zip(layers[::2], (np.sqrt(2), np.sqrt(2), gain), strict=True):
         nn.init.orthogonal_(layer.weight, scale)
         nn.init.zeros_(layer.bias)
@@ -73,13 +84,19 @@ class Driving:
 
     def __init__(self, layout: Layout, encoder: FrozenEncoder, n: int, rng: np.random.Generator):
         self._layout, self._encoder, self._rng = layout, encoder, rng
-        self._arena, self._camera, self._distance = Arena(layout, n), FastCamera(layout), RouteDistance(layout)
+        self._arena, self._camera, self._distance = (
+            Arena(layout, n),
+            FastCamera(layout),
+            RouteDistance(layout),
+        )
         self.route, self._entered, self._age = np.zeros(n, np.int64), np.zeros(n, bool), np.zeros(n, np.int64)
         self._restart(np.ones(n, bool))
 
     def observe(self) -> Float[Tensor, "n d"]:
         arena = self._arena
-        return with_route(self._encoder.latent(self._camera.frames(arena.pose, arena.slab, arena.scout[:, :2])), self.route)
+        return with_route(
+            self._encoder.latent(self._camera.frames(arena.pose, arena.slab, arena.scout[:, :2])), self.route
+        )
 
     def step(self, action):
         """One control step; returns rewards, obedient, terminated, ended and the observation before any reset."""
@@ -122,7 +139,9 @@ class Driving:
         self._age[which] = 0
 
 
-def train_executor(config: ExecutorConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray]) -> dict:
+def train_executor(
+    config: ExecutorConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray]
+) -> dict:
     """Pretrains the controller behind a frozen encoder; returns its weights and learning curves.
 
     "curve.*" have one entry an update: obedient share of the episodes that ended, their number, entropy.
@@ -144,7 +163,9 @@ def train_executor(config: ExecutorConfig, seed: int, *, report: Callable[[float
         report((i + 1) / updates)
     weights = {k: v.cpu().numpy() for k, v in policy.state_dict().items()}
     names = ("obedient", "episodes", "entropy")
-    return weights | {f"curve.{name}": np.array(c, np.float32) for name, c in zip(names, zip(*curves, strict=True), strict=True)}
+    return weights | {
+        f"curve.{name}": np.array(c, np.float32) for name, c in zip(names, zip(*curves, strict=True), strict=True)
+    }
 
 
 def _collect(driving: Driving, policy: Executor, config: ExecutorConfig, generator: torch.Generator):
@@ -162,7 +183,9 @@ def _collect(driving: Driving, policy: Executor, config: ExecutorConfig, generat
         steps.append((observation, action, log_prob, value, following, *flags))
         ended_count, obedient_count = ended_count + ended.sum(), obedient_count + obedient.sum()
         observation = driving.observe() if ended.any() else final
-    observations, actions, log_probs, values, following, rewards, terminated, ended = (torch.stack(s) for s in zip(*steps, strict=True))
+    observations, actions, log_probs, values, following, rewards, terminated, ended = (
+        torch.stack(s) for s in zip(*steps, strict=True)
+    )
     gain = ppo.advantages(rewards, values, following, terminated, ended, config.ppo.gamma, config.ppo.lam)
     flat = (t.flatten(0, 1) for t in (observations, actions, log_probs, gain, gain + values))
     return ppo.Batch(*flat), int(ended_count), int(obedient_count)

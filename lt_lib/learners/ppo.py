@@ -68,7 +68,14 @@ def advantages(
     return out
 
 
-def update(policy: Policy, optimiser: torch.optim.Optimizer, batch: Batch, config: PpoConfig, minibatch: int, rng: np.random.Generator) -> Statistics:
+def update(
+    policy: Policy,
+    optimiser: torch.optim.Optimizer,
+    batch: Batch,
+    config: PpoConfig,
+    minibatch: int,
+    rng: np.random.Generator,
+) -> Statistics:
     """`config.epochs` passes over the batch in shuffled minibatches; improves `policy` in place.
 
     Advantages are standardised over the whole batch, so a leftover minibatch of one is harmless.

@@ -55,7 +55,9 @@ class Protocol:
     weights: Path | None = None
 
     @classmethod
-    def of(cls, layout: str, device: str, workers: int, weights: str = "", shards: int = 8, **sections: Mapping) -> "Protocol":
+    def of(
+        cls, layout: str, device: str, workers: int, weights: str = "", shards: int = 8, **sections: Mapping
+    ) -> "Protocol":
         """From a notebook's parameters: `sections` are the dicts named as in params.SECTIONS."""
         shared = {"layout": layout, "device": device}
         configs = {
@@ -86,7 +88,11 @@ class Protocol:
 
     def frozen_encoder(self) -> Result:
         """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
-        trained = self._kept("encoder") if self.weights else self.store.fetch([Run(train_encoder, self.encoder, SEED)], "encoder")[0]
+        trained = (
+            self._kept("encoder")
+            if self.weights
+            else self.store.fetch([Run(train_encoder, self.encoder, SEED)], "encoder")[0]
+        )
         require_gates(self.gate_reports({"ours": trained})["ours"], self.gates)
         return trained
 
@@ -101,12 +107,20 @@ class Protocol:
 
     def save_executor(self, executor: Result, folder: Path) -> Path:
         """Keeps the frozen executor beside the frozen encoder."""
-        return save_frozen(folder, "executor", executor, load_layout(self.executor.layout), {"settings": self.executor.model_dump()})
+        return save_frozen(
+            folder,
+            "executor",
+            executor,
+            load_layout(self.executor.layout),
+            {"settings": self.executor.model_dump()},
+        )
 
     def episode_bank(self, encoder: Result, executor: Result) -> Result:
         """Every outcome of `shards` times `bank.entries` draws of the scene; arrays (entries, slab, route)."""
         inputs = {"encoder": encoder, "executor": executor}
-        shards = self.store.fetch([Run(roll_bank, self.bank, shard, inputs) for shard in range(self.shards)], "episode bank")
+        shards = self.store.fetch(
+            [Run(roll_bank, self.bank, shard, inputs) for shard in range(self.shards)], "episode bank"
+        )
         return {name: np.concatenate([shard[name] for shard in shards]) for name in shards[0]}
 
     def trained_heads(self, seeds: Mapping[str, int], bank: Result, encoder: Result) -> dict[str, list[Result]]:
@@ -123,7 +137,10 @@ class Protocol:
         """A frozen trained head under every wire condition of Table IV, greedily."""
         inputs = {"head": _weights_only(head), "bank": bank, "encoder": encoder}
         content = CONDITIONS[name].content
-        configs = [EvaluationConfig(content=content, wire=wire, layout=self.head.layout, episodes=episodes) for wire in CORRUPTIONS]
+        configs = [
+            EvaluationConfig(content=content, wire=wire, layout=self.head.layout, episodes=episodes)
+            for wire in CORRUPTIONS
+        ]
         runs = [Run(evaluate_head, config, SEED, inputs) for config in configs]
         return dict(zip(CORRUPTIONS, self.store.fetch(runs, f"corruption of {name}"), strict=True))
 

@@ -35,7 +35,13 @@ class Bank(NamedTuple):
         return Bank(self.wires[entries], Outcomes(*(values[entries] for values in self.outcomes)))
 
 
-def sent_wires(layout: Layout, encoder: FrozenEncoder, content: str, spawn: Float[np.ndarray, "e 3"], scout: Float[np.ndarray, "e 3"]) -> Float[Tensor, "e slab w"]:
+def sent_wires(
+    layout: Layout,
+    encoder: FrozenEncoder,
+    content: str,
+    spawn: Float[np.ndarray, "e 3"],
+    scout: Float[np.ndarray, "e 3"],
+) -> Float[Tensor, "e slab w"]:
     """What reaches the navigator at the commit step, under either placement: the scout sends what it sees one step earlier."""
     camera, wires = FastCamera(layout), []
     for slab in range(SLABS):
@@ -51,7 +57,9 @@ def sent_wires(layout: Layout, encoder: FrozenEncoder, content: str, spawn: Floa
     return torch.stack(wires, dim=1)
 
 
-def read_bank(config: HeadConfig | EvaluationConfig, bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]) -> tuple[Bank, Bank]:
+def read_bank(
+    config: HeadConfig | EvaluationConfig, bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]
+) -> tuple[Bank, Bank]:
     """The bank's training draws and its held-out draws, with the wires of the configured content."""
     layout, frozen = load_layout(config.layout), FrozenEncoder(encoder, best_device(config.device))
     wires = sent_wires(layout, frozen, config.content, bank["spawn"], bank["scout"])
@@ -60,7 +68,14 @@ def read_bank(config: HeadConfig | EvaluationConfig, bank: Mapping[str, np.ndarr
     return whole.take(slice(held_out, None)), whole.take(slice(held_out))
 
 
-def train_head(config: HeadConfig, seed: int, *, report: Callable[[float], None], bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]) -> dict:
+def train_head(
+    config: HeadConfig,
+    seed: int,
+    *,
+    report: Callable[[float], None],
+    bank: Mapping[str, np.ndarray],
+    encoder: Mapping[str, np.ndarray],
+) -> dict:
     """Trains one head; returns its weights, what became of every training episode, and a greedy evaluation.
 
     "head.*"           weights
@@ -102,7 +117,9 @@ def train_head(config: HeadConfig, seed: int, *, report: Callable[[float], None]
 
 
 @torch.no_grad()
-def evaluate(head: RouteHead, held_out: Bank, corruption: str, rng: np.random.Generator, episodes: int | None = None) -> dict[str, np.ndarray]:
+def evaluate(
+    head: RouteHead, held_out: Bank, corruption: str, rng: np.random.Generator, episodes: int | None = None
+) -> dict[str, np.ndarray]:
     """Greedy choices of a frozen head under a wire condition; every held-out draw under a placement drawn by chance.
 
     Returns "optimal", "success", "contacts", "length", "route", each (episodes,).
@@ -116,16 +133,32 @@ def evaluate(head: RouteHead, held_out: Bank, corruption: str, rng: np.random.Ge
     return played | {"route": route}
 
 
-def _played(outcomes: Outcomes, entry: Int[np.ndarray, " b"], slab: Int[np.ndarray, " b"], route: Int[np.ndarray, " b"]) -> dict[str, np.ndarray]:
+def _played(
+    outcomes: Outcomes,
+    entry: Int[np.ndarray, " b"],
+    slab: Int[np.ndarray, " b"],
+    route: Int[np.ndarray, " b"],
+) -> dict[str, np.ndarray]:
     """What became of episodes: optimal when the committed corridor is the slab-free one."""
     at = (entry, slab, route)
     return {
-        "optimal": route != slab, "success": outcomes.success[at], "contacts": outcomes.contacts[at],
-        "length": outcomes.length[at], "returns": outcomes.returns[at],
+        "optimal": route != slab,
+        "success": outcomes.success[at],
+        "contacts": outcomes.contacts[at],
+        "length": outcomes.length[at],
+        "returns": outcomes.returns[at],
     }
 
 
-def evaluate_head(config: EvaluationConfig, seed: int, *, report: Callable[[float], None], head: Mapping[str, np.ndarray], bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]) -> dict:
+def evaluate_head(
+    config: EvaluationConfig,
+    seed: int,
+    *,
+    report: Callable[[float], None],
+    head: Mapping[str, np.ndarray],
+    bank: Mapping[str, np.ndarray],
+    encoder: Mapping[str, np.ndarray],
+) -> dict:
     """One cell of Table IV: a frozen trained head under one wire condition, greedily."""
     _, held_out = read_bank(config, bank, encoder)
     return evaluate(read_head(head), held_out, config.wire, np.random.default_rng([seed, 4]), config.episodes)

@@ -19,10 +19,14 @@ class Encoder(nn.Module):
     def __init__(self):
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv2d(3, 32, kernel_size=8, stride=4), nn.ReLU(),  # (B, 32, 15, 15)
-            nn.Conv2d(32, 64, kernel_size=4, stride=2), nn.ReLU(),  # (B, 64, 6, 6)
-            nn.Conv2d(64, 64, kernel_size=3, stride=1), nn.ReLU(),  # (B, 64, 4, 4)
-            nn.Flatten(), nn.Linear(1024, LATENT),
+            nn.Conv2d(3, 32, kernel_size=8, stride=4),
+            nn.ReLU(),  # (B, 32, 15, 15)
+            nn.Conv2d(32, 64, kernel_size=4, stride=2),
+            nn.ReLU(),  # (B, 64, 6, 6)
+            nn.Conv2d(64, 64, kernel_size=3, stride=1),
+            nn.ReLU(),  # (B, 64, 4, 4)
+            nn.Flatten(),
+            nn.Linear(1024, LATENT),
         ).to(memory_format=torch.channels_last)
 
     def forward(self, frames: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b 64"]:
@@ -61,7 +65,9 @@ class FrozenEncoder:
         self.device, self._dtype = torch.device(device), getattr(torch, precision)
         self._encoder, self._predictor = Encoder(), Predictor()
         for module, prefix in ((self._encoder, "E."), (self._predictor, "P.")):
-            module.load_state_dict({k.removeprefix(prefix): torch.tensor(v) for k, v in weights.items() if k.startswith(prefix)})
+            module.load_state_dict(
+                {k.removeprefix(prefix): torch.tensor(v) for k, v in weights.items() if k.startswith(prefix)}
+            )
             module.to(self.device, self._dtype).requires_grad_(False)
         self._encoder.to(memory_format=torch.channels_last)
         self._mean = torch.tensor(weights["mean"], device=self.device)

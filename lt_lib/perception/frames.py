@@ -45,7 +45,9 @@ def _rollouts(layout: Layout, n: int, length: int, rng: np.random.Generator) -> 
     return Rollouts(*(np.stack(part, axis=1) for part in (frames, actions, poses)))
 
 
-def free_poses(layout: Layout, slab: Int[np.ndarray, " n"], rng: np.random.Generator, apart_from=None) -> Float[np.ndarray, "n 3"]:
+def free_poses(
+    layout: Layout, slab: Int[np.ndarray, " n"], rng: np.random.Generator, apart_from=None
+) -> Float[np.ndarray, "n 3"]:
     """Poses uniform over the free arena, clear of walls, of the slab and of other robots (n, 2 or 3)."""
     n, radius = len(slab), layout.robot.radius
     pose, missing = np.empty((n, 3)), np.ones(n, bool)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from scipy.stats import t
 from sklearn.linear_model import LinearRegression, LogisticRegression
+from sklearn.manifold import TSNE
 
 from lt_lib.envs.layout import load_layout
 from lt_lib.params import GateConfig, Gates, UserError
@@ -53,10 +54,12 @@ def encode(encoder: FrozenEncoder, frames: UInt8[np.ndarray, "*batch h w"]) -> F
     return latents.numpy().reshape(*frames.shape[:-2], LATENT)
 
 
-def measure_gates(config: GateConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray]) -> dict:
+def measure_gates(
+    config: GateConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray]
+) -> dict:
     """Probes and rank of a checkpoint on held-out rollouts; also the latents' picture.
 
-    Fields of `Measured`, and for `config.shown` frames: "latent.plane" (n, 2) first two principal components,
+    Fields of `Measured`, and for `config.shown` frames: "latent.plane" (n, 2) by t-SNE,
     "latent.pose" (n, 3), "latent.hazard" (n,) pixels of hazard.
     """
     rng = np.random.default_rng([seed, 5])
@@ -72,9 +75,13 @@ def measure_gates(config: GateConfig, seed: int, *, report: Callable[[float], No
     wall_probe = LinearRegression().fit(train, walls[:cut].ravel())
     commoner = visible[:cut].mean() > 0.5
     found = Measured(
-        float(right.mean()), float(low), float(min(high, 1.0)), float((visible[cut:] == commoner).mean()),
+        float(right.mean()),
+        float(low),
+        float(min(high, 1.0)),
+        float((visible[cut:] == commoner).mean()),
         float(wall_probe.score(test, walls[cut:].ravel())),
-        effective_rank(latents.reshape(-1, LATENT)), effective_rank(latents.reshape(-1, LATENT), power=2),
+        effective_rank(latents.reshape(-1, LATENT)),
+        effective_rank(latents.reshape(-1, LATENT), power=2),
     )
     return found._asdict() | _picture(rollouts, latents, config.shown, rng)
 
@@ -83,9 +90,10 @@ def _picture(rollouts, latents, n: int, rng: np.random.Generator) -> dict:
     frames = rollouts.frames.reshape(-1, *rollouts.frames.shape[2:])
     flat = latents.reshape(-1, LATENT)
     shown = rng.choice(len(flat), min(n, len(flat)), replace=False)
-    axes = np.linalg.svd(flat - flat.mean(0), full_matrices=False)[2][:2]
+    # not principal components: a latent of high rank has no two that stand for the rest
+    plane = TSNE(perplexity=min(30, len(shown) // 4), init="pca", random_state=0).fit_transform(flat[shown])
     return {
-        "latent.plane": (flat[shown] - flat.mean(0)) @ axes.T,
+        "latent.plane": plane,
         "latent.pose": rollouts.poses.reshape(-1, 3)[shown],
         "latent.hazard": hazard_visible(frames[shown]),
     }

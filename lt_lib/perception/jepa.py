@@ -71,7 +71,13 @@ class Jepa(nn.Module):
         self.readout = nn.Linear(LATENT, len(weights) * GRID * GRID)
         self.register_buffer("class_weights", weights)
 
-    def losses(self, frames: Float[Tensor, "b h w 3"], actions: Float[Tensor, "b 3"], following: Float[Tensor, "b h w 3"], classes: Int[Tensor, "b g g"]) -> Losses:
+    def losses(
+        self,
+        frames: Float[Tensor, "b h w 3"],
+        actions: Float[Tensor, "b 3"],
+        following: Float[Tensor, "b h w 3"],
+        classes: Int[Tensor, "b g g"],
+    ) -> Losses:
         latent = self.encoder(frames)
         with torch.no_grad():
             goal = self.target(following)
@@ -103,10 +109,14 @@ def train_encoder(config: EncoderConfig, seed: int, *, report: Callable[[float],
     cells = _cells(rollouts.frames)
     with torch.random.fork_rng(devices=[]):  # module initialisation draws from torch's global generator
         torch.manual_seed(seed)
-        model = Jepa(class_weights(classes[cells], classes.max() + 1)).to(device)
+        model = Jepa(class_weights(classes[cells], int(classes.max()) + 1)).to(device)
     curves = _fit(model, rollouts, torch.from_numpy(classes)[torch.from_numpy(cells).long()], config, rng, report)
     mean, std = _moments(model.encoder, rollouts.frames, device)
-    weights = {f"{p}.{k}": v.cpu().numpy() for p, m in (("E", model.encoder), ("P", model.predictor)) for k, v in m.state_dict().items()}
+    weights = {
+        f"{p}.{k}": v.cpu().numpy()
+        for p, m in (("E", model.encoder), ("P", model.predictor))
+        for k, v in m.state_dict().items()
+    }
     return weights | {"mean": mean, "std": std} | curves
 
 
@@ -119,7 +129,9 @@ def _cells(frames):
 def _fit(model: Jepa, rollouts, classes, config: EncoderConfig, rng: np.random.Generator, report) -> dict:
     frames, actions = rollouts.frames, torch.from_numpy(rollouts.actions)
     device = model.class_weights.device
-    pairs = np.stack(np.meshgrid(np.arange(frames.shape[0]), np.arange(frames.shape[1] - 1), indexing="ij"), -1).reshape(-1, 2)
+    pairs = np.stack(
+        np.meshgrid(np.arange(frames.shape[0]), np.arange(frames.shape[1] - 1), indexing="ij"), -1
+    ).reshape(-1, 2)
     updates = int(config.epochs * len(pairs) / config.batch)
     curves = np.zeros((updates, len(Losses._fields)), np.float32)
     if updates == 0:
@@ -151,6 +163,9 @@ def _named(curves) -> dict:
 def _moments(encoder: Encoder, frames, device, chunk: int = 1024):
     """Mean and standard deviation of the latent over all training frames, (64,) each."""
     flat = frames.reshape(-1, *frames.shape[2:])
-    latents = [encoder(torch.from_numpy(network_input(flat[i : i + chunk])).to(device)).cpu() for i in range(0, len(flat), chunk)]
+    latents = [
+        encoder(torch.from_numpy(network_input(flat[i : i + chunk])).to(device)).cpu()
+        for i in range(0, len(flat), chunk)
+    ]
     latents = torch.cat(latents).double()
     return latents.mean(0).float().numpy(), (latents.std(0) + 1e-6).float().numpy()

@@ -19,8 +19,11 @@ def save_frozen(folder: Path, kind: str, arrays: Mapping[str, np.ndarray], layou
     """Writes <kind>.safetensors, then <kind>.json: what it is, the scene it was trained in, how, and its checksum."""
     payload = safetensors.numpy.save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
     sidecar = {
-        "format": FORMAT, "kind": kind, "sha256": hashlib.sha256(payload).hexdigest(),
-        "layout": layout.model_dump(mode="json"), **facts,
+        "format": FORMAT,
+        "kind": kind,
+        "sha256": hashlib.sha256(payload).hexdigest(),
+        "layout": layout.model_dump(mode="json"),
+        **facts,
     }
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / f"{kind}.safetensors", payload)
@@ -37,17 +40,25 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
     path, sidecar_path = folder / f"{kind}.safetensors", folder / f"{kind}.json"
     for needed in (path, sidecar_path):
         if not needed.is_file():
-            raise UserError(f"weights: {needed} is missing; give a folder that holds {kind}.safetensors and {kind}.json")
+            raise UserError(
+                f"weights: {needed} is missing; give a folder that holds {kind}.safetensors and {kind}.json"
+            )
     payload = path.read_bytes()
     try:
         sidecar = json.loads(sidecar_path.read_text(encoding="utf-8"))
         found = (sidecar["kind"], sidecar["format"], sidecar["sha256"], sidecar["layout"])
     except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"weights: {sidecar_path} is no sidecar of frozen weights ({error!r}); freeze them again") from error
+        raise UserError(
+            f"weights: {sidecar_path} is no sidecar of frozen weights ({error!r}); freeze them again"
+        ) from error
     if found[:2] != (kind, FORMAT):
         raise UserError(f"weights: {path} holds a {found[0]} of format {found[1]}, not a {kind} of format {FORMAT}")
     if hashlib.sha256(payload).hexdigest() != found[2]:
-        raise UserError(f"weights: {path} is truncated or altered (its checksum differs from {sidecar_path.name}'s); freeze it again")
+        raise UserError(
+            f"weights: {path} is truncated or altered (its checksum differs from {sidecar_path.name}'s); freeze it again"
+        )
     if Layout(**found[3]) != layout:
-        raise UserError(f"weights: {path} was trained in another scene than layout '{layout.name}'; train it there, or use its layout")
+        raise UserError(
+            f"weights: {path} was trained in another scene than layout '{layout.name}'; train it there, or use its layout"
+        )
     return safetensors.numpy.load(payload)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pandas as pd
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
@@ -246,19 +245,6 @@ class Findings:
         _check_shape(self.claims[name], finding, where)
         self.found[name] = finding
 
-    def table(self) -> pd.DataFrame:
-        """What was found so far beside the paper's, for the notebook's own reader."""
-        rows = {
-            name: {
-                "what": self.claims[name].what, "paper": self.claims[name].paper, "ours": _short(finding.value),
-                "95% interval": "" if finding.low is None else f"{_short(finding.low)} to {_short(finding.high)}",
-                "test": finding.test, "p": "" if finding.p is None else f"{finding.p:.3g}",
-                "verdict": verdict(self.claims[name], finding, self.profile) or f"none at size {self.profile}",
-            }
-            for name, finding in self.found.items()
-        }  # fmt: skip
-        return pd.DataFrame.from_dict(rows, orient="index")
-
     def write(self, pending: Collection[str] = ()) -> Path:
         """Writes the results file, whole or not at all, and returns its path.
 
@@ -273,9 +259,7 @@ class Findings:
                 raise UserError(f"{self.notebook}: {name} is given as pending but {reason}")
         missing = [name for name in self.claims if name not in self.found and name not in pending]
         if missing:
-            raise UserError(
-                f"{self.notebook}: no finding for {', '.join(missing)}; add it or call it pending"
-            )
+            raise UserError(f"{self.notebook}: no finding for {', '.join(missing)}; add it or call it pending")
         entries = {
             name: self.found[name].model_dump() | {"verdict": verdict(claim, self.found[name], self.profile)}
             for name, claim in self.claims.items()
@@ -286,13 +270,6 @@ class Findings:
         writable_folder(self.path.parent)
         write_atomically(self.path, text.encode())
         return self.path
-
-
-def _short(value: Any) -> Any:
-    """Floats to four digits, lists too."""
-    if isinstance(value, tuple):
-        return ", ".join(str(_short(item)) for item in value)
-    return f"{value:.4g}" if isinstance(value, float) else value
 
 
 def _plain(item: Any) -> Any:
@@ -307,9 +284,7 @@ def _check_shape(claim: Claim, finding: Finding, where: str) -> None:
     ours, paper = numbers(finding.value), numbers(claim.paper)
     alike = isinstance(finding.value, str) if paper is None else ours and len(paper) in (1, len(ours))
     if not alike:
-        raise UserError(
-            f"{where}: value {finding.value!r} is not comparable with the paper's {claim.paper!r}"
-        )
+        raise UserError(f"{where}: value {finding.value!r} is not comparable with the paper's {claim.paper!r}")
     if claim.judged_in_words and finding.holds is None:
         raise UserError(f"{where}: holds must be True or False, its check is only in words: {claim.check}")
     if finding.low is None and finding.high is None:
@@ -318,6 +293,4 @@ def _check_shape(claim: Claim, finding: Finding, where: str) -> None:
         raise UserError(f"{where}: low and high go together, got {finding.low} and {finding.high}")
     lows, highs = numbers(finding.low), numbers(finding.high)
     if not len(lows) == len(highs) == len(ours or ()) or any(map(operator.gt, lows, highs)):
-        raise UserError(
-            f"{where}: expected low <= high a number of the value, got {finding.low}, {finding.high}"
-        )
+        raise UserError(f"{where}: expected low <= high a number of the value, got {finding.low}, {finding.high}")

@@ -17,7 +17,13 @@ from lt_lib.report.style import ROLES, chance_line
 from lt_lib.runs import Result
 
 Rows = Sequence[Mapping[str, Result]]
-IDS = {"intact": "intact", "content_zeroed": "content", "wire_zeroed": "wire", "sender_shuffled": "shuffle", "matched_noise": "noise"}
+IDS = {
+    "intact": "intact",
+    "content_zeroed": "content",
+    "wire_zeroed": "wire",
+    "sender_shuffled": "shuffle",
+    "matched_noise": "noise",
+}
 AT_CHANCE = (0.35, 0.65)  # route optimality of a destroyed cell
 ALPHA = 0.001  # of the drop, for every head
 
@@ -59,7 +65,11 @@ def judge(rows: Rows, wire: str) -> dict[str, Any]:
     p = max(stats.drop_test(*count) for count in counts)
     low, high = AT_CHANCE
     holds = bool(p < ALPHA and low <= cell.min() and cell.max() <= high)
-    return finding | {"test": "Fisher exact drop from intact, largest p of the heads; each within 0.35 to 0.65", "p": p, "holds": holds}
+    return finding | {
+        "test": "Fisher exact drop from intact, largest p of the heads; each within 0.35 to 0.65",
+        "p": p,
+        "holds": holds,
+    }
 
 
 def table(cells: Mapping[str, Mapping[str, np.ndarray]], claims: Mapping[str, Claim]) -> pd.DataFrame:
@@ -69,15 +79,23 @@ def table(cells: Mapping[str, Mapping[str, np.ndarray]], claims: Mapping[str, Cl
         row = {}
         for name, by_wire in cells.items():
             values, told = by_wire[wire], claims[claim_id(name, wire)]
-            row[name] = f"{values.mean():.3f}" + (f" ({values.min():.3f} to {values.max():.3f})" if len(values) > 1 else "")
-            row[f"{name}, paper"] = f"{told.paper:.3f}" + (f" ({told.range[0]:.3f} to {told.range[1]:.3f})" if told.range else "")
+            row[name] = f"{values.mean():.3f}" + (
+                f" ({values.min():.3f} to {values.max():.3f})" if len(values) > 1 else ""
+            )
+            row[f"{name}, paper"] = f"{told.paper:.3f}" + (
+                f" ({told.range[0]:.3f} to {told.range[1]:.3f})" if told.range else ""
+            )
         rows[wire.replace("_", " ")] = row
     return pd.DataFrame(rows).T
 
 
 def left_shares(cells: Mapping[str, Rows]) -> pd.DataFrame:
     """Share of episodes in which each head took the left corridor, by wire condition."""
-    columns = {f"{name} {i}": {wire: 1 - row[wire]["route"].mean() for wire in row} for name, rows in cells.items() for i, row in enumerate(rows)}
+    columns = {
+        f"{name} {i}": {wire: 1 - row[wire]["route"].mean() for wire in row}
+        for name, rows in cells.items()
+        for i, row in enumerate(rows)
+    }
     return pd.DataFrame(columns).rename(index=lambda wire: wire.replace("_", " ")).round(3)
 
 
@@ -106,7 +124,12 @@ def lengths(rows: Rows) -> Figure:
     panels = figure.subplots(1, len(IDS), sharex=True, sharey=True)
     for axes, wire in zip(panels, IDS, strict=True):
         values = np.concatenate([row[wire]["length"] for row in rows])
-        axes.hist(values, bins=np.arange(0, 625, 25), weights=np.full(len(values), 1 / len(values)), color=ROLES["ours"])
+        axes.hist(
+            values,
+            bins=np.arange(0, 625, 25),
+            weights=np.full(len(values), 1 / len(values)),
+            color=ROLES["ours"],
+        )
         axes.axvline(values.mean(), color="black", lw=1.2)
         axes.set_title(f"{wire.replace('_', ' ')}\nmean {values.mean():.0f}", fontsize=9)
         axes.set_xlabel("control steps")

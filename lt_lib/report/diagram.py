@@ -23,7 +23,12 @@ def pipeline(layout: Layout) -> Figure:
         "jepa": (2.5, 2.9, "joint-embedding\nprediction +\nvariance, covariance", TRAINED),
         "scout": (0.1, 0.5, "scout's frame\n(sees the slab)", "white"),
         "E": (2.5, 0.5, f"encoder E, frozen\n{messages.CONTENT} floats", FROZEN),
-        "wire": (4.9, 0.5, f"wire: anchor {channel.ANCHOR}\n+ content {messages.CONTENT} = {width}\n{channel.LATENCY} step of latency", "white"),
+        "wire": (
+            4.9,
+            0.5,
+            f"wire: anchor {channel.ANCHOR}\n+ content {messages.CONTENT} = {width}\n{channel.LATENCY} step of latency",
+            "white",
+        ),
         "head": (7.3, 0.5, "route head\ncommits once\nan episode", TRAINED),
         "executor": (9.7, 0.5, "executor, frozen\nown view, route;\ncannot read the wire", FROZEN),
         "goal": (9.7, 2.9, "episode return:\n+1 arrival,\n-0.01 a contact step", "white"),
@@ -31,10 +36,28 @@ def pipeline(layout: Layout) -> Figure:
     for x, y, text, colour in boxes.values():
         axes.add_patch(FancyBboxPatch((x, y), 1.9, 1.1, boxstyle="round,pad=0.06", fc=colour, ec="0.3"))
         axes.text(x + 0.95, y + 0.55, text, ha="center", va="center", fontsize=9)
-    for tail, head in (("frames", "jepa"), ("scout", "E"), ("E", "wire"), ("wire", "head"), ("head", "executor")):
-        _arrow(axes, (boxes[tail][0] + 1.98, boxes[tail][1] + 0.55), (boxes[head][0] - 0.08, boxes[head][1] + 0.55), "0.2")
+    for tail, head in (
+        ("frames", "jepa"),
+        ("scout", "E"),
+        ("E", "wire"),
+        ("wire", "head"),
+        ("head", "executor"),
+    ):
+        _arrow(
+            axes,
+            (boxes[tail][0] + 1.98, boxes[tail][1] + 0.55),
+            (boxes[head][0] - 0.08, boxes[head][1] + 0.55),
+            "0.2",
+        )
     _arrow(axes, (3.45, 2.82), (3.45, 1.7), ROLES["ours"])
-    axes.text(3.55, 2.25, "gates, then freeze;\nsame copy on both robots", fontsize=8, va="center", color=ROLES["ours"])
+    axes.text(
+        3.55,
+        2.25,
+        "gates, then freeze;\nsame copy on both robots",
+        fontsize=8,
+        va="center",
+        color=ROLES["ours"],
+    )
     _arrow(axes, (10.65, 1.7), (10.65, 2.82), "0.2")
     _arrow(axes, (9.62, 3.3), (8.25, 1.7), GRADIENT)
     axes.text(7.5, 2.75, "the only gradient", fontsize=9, color=GRADIENT, ha="center")

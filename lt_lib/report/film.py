@@ -31,7 +31,16 @@ class Take(NamedTuple):
     route: int
 
 
-def record(layout: Layout, encoder: FrozenEncoder, executor: FrozenExecutor, draws: Draws, entry: int, slab: int, route: int, commit_step: int) -> Take:
+def record(
+    layout: Layout,
+    encoder: FrozenEncoder,
+    executor: FrozenExecutor,
+    draws: Draws,
+    entry: int,
+    slab: int,
+    route: int,
+    commit_step: int,
+) -> Take:
     """Drives one draw of the scene to the goal or the time-out, keeping the navigator's poses."""
     arena, camera, scout = Arena(layout, 1), FastCamera(layout), draws.scout[entry : entry + 1]
     arena.reset(np.ones(1, bool), draws.spawn[entry : entry + 1], np.array([slab]), scout)
@@ -64,7 +73,11 @@ def _captioned(picture, words: str, left: int) -> UInt8[np.ndarray, "h w 3"]:
     canvas = Image.new("RGB", (picture.shape[1], picture.shape[0] + BAND), "white")
     canvas.paste(Image.fromarray(picture), (0, BAND))
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(13)
-    for x, text in ((4, words), (left + 10, "navigator sees"), (left + picture.shape[0] + 16, "scout sees, and sends")):
+    for x, text in (
+        (4, words),
+        (left + 10, "navigator sees"),
+        (left + picture.shape[0] + 16, "scout sees, and sends"),
+    ):
         draw.text((x, 3), text, fill="black", font=font)
     return np.asarray(canvas)
 
@@ -77,7 +90,15 @@ def save_gif(path: Path, frames: Sequence[UInt8[np.ndarray, "h w 3"]], seconds_a
     return path
 
 
-def film_pair(layout: Layout, heads: Mapping[str, Sequence[Result]], bank: Result, encoder: Result, executor: Result, commit_step: int, folder: Path) -> list[Path]:
+def film_pair(
+    layout: Layout,
+    heads: Mapping[str, Sequence[Result]],
+    bank: Result,
+    encoder: Result,
+    executor: Result,
+    commit_step: int,
+    folder: Path,
+) -> list[Path]:
     """Films the first held-out draw once with the first latent head and once with the first floor head, choices greedy.
 
     The slab stands in the corridor that the floor's head prefers, so that the pair shows what the message is good for.

@@ -28,9 +28,7 @@ def figure(board: pd.DataFrame, claims: Mapping[str, Claim], profile: str) -> Fi
     board   of `scoreboard.join`
     claims  those the board was made from: their units tell the panels apart
     """
-    rows = board[
-        (board.kind == "measured") & board.id.map(lambda name: numbers(claims[name].paper) is not None)
-    ]
+    rows = board[(board.kind == "measured") & board.id.map(lambda name: numbers(claims[name].paper) is not None)]
     units = rows.id.map(lambda name: claims[name].unit)
     panels = [rows.assign(unit=units)[units == ""], rows.assign(unit=units)[units != ""]]
     heights = [len(panel) + panel.notebook.nunique() for panel in panels]
@@ -43,9 +41,7 @@ def figure(board: pd.DataFrame, claims: Mapping[str, Claim], profile: str) -> Fi
     lower.set(xlim=(-0.05, WIDEST + 0.05), xlabel=f"ours / paper (arrow: beyond {WIDEST})")
     _legend(upper, board)
     fig.suptitle(
-        "\n".join(
-            filter(None, ["Paper against ours: every measured claim", summary(board), stamp(board, profile)])
-        )
+        "\n".join(filter(None, ["Paper against ours: every measured claim", summary(board), stamp(board, profile)]))
     )
     if profile not in JUDGED:
         for height in (0.25, 0.7):
@@ -90,16 +86,12 @@ def _claim(axes: Axes, row: Mapping[str, Any], y: Number) -> None:
     text = f"{shown(row['paper'])}  →  {shown(row['ours'])}" if ours else shown(row["paper"])
     side = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 7.5}
     axes.text(1.01, y, mark.sign, color=mark.colour, fontweight="bold", **side)
-    axes.text(
-        1.035, y, f"{text} {row['unit']}", color="0.5" if row["verdict"] == NOT_RUN else "black", **side
-    )
+    axes.text(1.035, y, f"{text} {row['unit']}", color="0.5" if row["verdict"] == NOT_RUN else "black", **side)
 
 
 def _dot(axes: Axes, x: Number, y: Number, mark: Mark) -> None:
     beyond = x >= WIDEST
-    axes.plot(
-        x, y, marker=">" if beyond else mark.marker, color=mark.colour, mec="white", mew=0.5, ms=7, zorder=3
-    )
+    axes.plot(x, y, marker=">" if beyond else mark.marker, color=mark.colour, mec="white", mew=0.5, ms=7, zorder=3)
 
 
 def _components(value: Any) -> tuple[Number, ...]:
@@ -125,6 +117,4 @@ def _legend(axes: Axes, board: pd.DataFrame) -> None:
         Line2D([], [], marker=MARKS[kind].marker, color=MARKS[kind].colour, lw=1.6, ms=7, label=told(kind))
         for kind in kinds
     ]
-    axes.legend(
-        handles=[PAPER, *handles], loc="lower center", bbox_to_anchor=(0.5, 1), ncols=6, frameon=False
-    )
+    axes.legend(handles=[PAPER, *handles], loc="lower center", bbox_to_anchor=(0.5, 1), ncols=6, frameon=False)

@@ -14,7 +14,13 @@ from lt_lib.perception.jepa import GRID, colour_classes
 from lt_lib.report.style import ROLES
 from lt_lib.runs import Result
 
-GATES = {"hazard": "hazard-visible probe", "majority": "majority baseline", "walls": "wall-count R²", "rank": "effective rank", "rank_eigen": "(by eigenvalues)"}
+GATES = {
+    "hazard": "hazard-visible probe",
+    "majority": "majority baseline",
+    "walls": "wall-count R²",
+    "rank": "effective rank",
+    "rank_eigen": "(by eigenvalues)",
+}
 
 
 def gate_table(reports: Mapping[str, Result], thresholds: Mapping[str, float]) -> pd.DataFrame:
@@ -30,10 +36,17 @@ def training_frames(frames: UInt8[np.ndarray, "n h w"]) -> Figure:
     panels = figure.subplots(2, len(frames))
     step = frames.shape[-1] // GRID
     classes = colour_classes()
-    palette = ListedColormap([colours(np.array([[np.flatnonzero(classes == c)[0]]], np.uint8))[0, 0] / 255 for c in range(classes.max() + 1)])
+    palette = ListedColormap(
+        [colours(np.array([[np.flatnonzero(classes == c)[0]]], np.uint8))[0, 0] / 255 for c in range(classes.max() + 1)]
+    )
     for (upper, lower), frame in zip(panels.T, frames, strict=True):
         upper.imshow(colours(frame))
-        lower.imshow(classes[frame[step // 2 :: step, step // 2 :: step]], cmap=palette, vmin=-0.5, vmax=classes.max() + 0.5)
+        lower.imshow(
+            classes[frame[step // 2 :: step, step // 2 :: step]],
+            cmap=palette,
+            vmin=-0.5,
+            vmax=classes.max() + 0.5,
+        )
         upper.set_title("hazard in view" if hazard_visible(frame) else "", fontsize=8, color="#B22222")
         for axes in (upper, lower):
             axes.set(xticks=[], yticks=[])
@@ -49,7 +62,13 @@ def loss_curves(encoders: Mapping[str, Result]) -> Figure:
     for axes, term in zip(figure.subplots(1, len(terms)), terms, strict=True):
         for (name, encoder), colour in zip(encoders.items(), (ROLES["ours"], ROLES["upper bound"]), strict=True):
             values = np.maximum(encoder[f"loss.{term}"], 1e-8)
-            axes.semilogy(np.arange(len(values)), pd.Series(values).rolling(10, min_periods=1).mean(), color=colour, lw=1.2, label=name)
+            axes.semilogy(
+                np.arange(len(values)),
+                pd.Series(values).rolling(10, min_periods=1).mean(),
+                color=colour,
+                lw=1.2,
+                label=name,
+            )
         axes.set(title=term, xlabel="update")
     axes.legend(fontsize=8)
     figure.supylabel("loss, mean of 10 updates")
@@ -57,18 +76,20 @@ def loss_curves(encoders: Mapping[str, Result]) -> Figure:
 
 
 def latent_map(report: Mapping[str, Float[np.ndarray, "n ..."]]) -> Figure:
-    """The latent's first two principal components on held-out frames, coloured by where, which way, and whether the slab shows."""
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    """A t-SNE of held-out frames' latents, coloured by where, which way, and whether the slab shows."""
+    figure = Figure(figsize=(13, 4.4), layout="constrained")
     first, second, third = figure.subplots(1, 3, sharex=True, sharey=True)
     plane, pose, hazard = report["latent.plane"], report["latent.pose"], report["latent.hazard"].astype(bool)
     dots = {"s": 5, "lw": 0}
     heading = np.rad2deg(np.angle(np.exp(1j * pose[:, 2])))
-    for axes, values, label, cmap in ((first, pose[:, 0], "x (m): barrier from -1.5 to 1.2", "viridis"), (second, heading, "heading (degrees)", "twilight")):
+    for axes, values, label, cmap in (
+        (first, pose[:, 0], "x (m): barrier from -1.5 to 1.2", "viridis"),
+        (second, heading, "heading (degrees)", "twilight"),
+    ):
         figure.colorbar(axes.scatter(*plane.T, c=values, cmap=cmap, **dots), ax=axes, label=label)
     third.scatter(*plane[~hazard].T, color="0.75", label="no hazard in view", **dots)
     third.scatter(*plane[hazard].T, color="#B22222", label="hazard in view", **dots)
     third.legend(markerscale=3, fontsize=8)
-    first.set_ylabel("second principal component")
     for axes in (first, second, third):
-        axes.set_xlabel("first principal component")
+        axes.set(xticks=[], yticks=[], xlabel="t-SNE of the latent")
     return figure

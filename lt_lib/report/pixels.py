@@ -39,10 +39,18 @@ def judge(name: str, shares: np.ndarray, floor: np.ndarray, latent: np.ndarray) 
     match CONDITIONS[name].role:
         case "ours" | "diagnostic":
             p = stats.rank_test(shares, floor)
-            return finding | {"test": "exact rank test, above the floor", "p": p, "holds": bool(shares.min() > floor.max())}
+            return finding | {
+                "test": "exact rank test, above the floor",
+                "p": p,
+                "holds": bool(shares.min() > floor.max()),
+            }
         case "upper bound":
             p = stats.rank_test(latent, shares)
-            return finding | {"test": "exact rank test, latent above it; holds if no better", "p": p, "holds": bool(shares.mean() <= latent.mean())}
+            return finding | {
+                "test": "exact rank test, latent above it; holds if no better",
+                "p": p,
+                "holds": bool(shares.mean() <= latent.mean()),
+            }
     p = stats.chance_equivalence(shares)
     return finding | {"test": "equivalence with chance +- 0.1 (TOST)", "p": p, "holds": p < ALPHA}
 
@@ -52,8 +60,13 @@ def table(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> pd
     rows = []
     for name, results in heads.items():
         row = {"message content": CONDITIONS[name].words.replace("$", ""), "n": len(results)}
-        row["message content"] = {"latent": "latent z", "predicted": "predicted z-hat"}.get(name, row["message content"])
-        for column, key, claim in (("route opt.", "optimal", "route"), ("task success", "success", "success")):
+        row["message content"] = {"latent": "latent z", "predicted": "predicted z-hat"}.get(
+            name, row["message content"]
+        )
+        for column, key, claim in (
+            ("route opt.", "optimal", "route"),
+            ("task success", "success", "success"),
+        ):
             shares, told = final_shares(results, key), paper[f"px.{name.replace('_', '')}.{claim}"]
             row[column] = f"{shares.mean():.3f} ± {shares.std(ddof=1):.3f}"
             row[f"{column}, paper"] = f"{told.paper:.3f} ± {told.sd:.3f}"
@@ -79,7 +92,10 @@ def routes(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> F
     chance_line(axes)
     axes.set_xticks(range(len(heads)), [_wrapped(name) for name in heads], fontsize=9)
     axes.set(ylim=(0.0, 1.06), ylabel="route optimality\n(share of episodes in the slab-free corridor)")
-    axes.set_title("Only the message content differs. Dot: a seed; bar: our mean; hollow diamond: the paper's mean", fontsize=11)
+    axes.set_title(
+        "Only the message content differs. Dot: a seed; bar: our mean; hollow diamond: the paper's mean",
+        fontsize=11,
+    )
     for role, colour in ROLES.items():
         axes.plot([], [], "o", color=colour, label=role)
     axes.legend(loc="lower left", ncols=3, fontsize=9)

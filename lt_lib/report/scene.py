@@ -28,7 +28,10 @@ def four_pictures(layout: Layout, camera: ReferenceCamera, seen: Occlusion) -> F
     seen  the hazard pixels that are printed over (c) and (d), counted by the same camera
     """
     figure = Figure(figsize=(14, 6.2), layout="constrained")
-    figure.suptitle(f"Who can see the slab: hazard pixels by MuJoCo's segmentation, of {camera.pixels**2:,} a frame", fontsize=10)
+    figure.suptitle(
+        f"Who can see the slab: hazard pixels by MuJoCo's segmentation, of {camera.pixels**2:,} a frame",
+        fontsize=10,
+    )
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.3, 1))
     arena_above, arena_plan = upper.subplots(1, 2)
     places = [(f"(c) navigator, choice point {i + 1}", p, layout.scout) for i, p in enumerate(layout.choice_points)]
@@ -87,7 +90,9 @@ def robot(axes: Axes, layout: Layout, pose: Pose, colour: str, name: str) -> Non
     half, back = layout.camera.fov / 2, -np.sign(np.cos(pose.array[2]))
     place = (pose.x + back * 1.5 * layout.robot.radius, pose.y)
     axes.annotate(name, place, ha="left" if back > 0 else "right", va="center", fontsize=8)
-    axes.add_patch(Wedge((pose.x, pose.y), 0.9, pose.heading - half, pose.heading + half, color=colour, alpha=0.3, lw=0))
+    axes.add_patch(
+        Wedge((pose.x, pose.y), 0.9, pose.heading - half, pose.heading + half, color=colour, alpha=0.3, lw=0)
+    )
     axes.add_patch(Circle((pose.x, pose.y), layout.robot.radius, color=colour, lw=0))
 
 
@@ -143,7 +148,12 @@ def leak(layout: Layout, camera: ReferenceCamera, slab: int, point: int) -> Figu
     return figure
 
 
-def cameras(fast: UInt8[np.ndarray, "b h w"], reference: UInt8[np.ndarray, "b h w 3"], differ: Bool[np.ndarray, "b h w"], names: Sequence[str]) -> Figure:
+def cameras(
+    fast: UInt8[np.ndarray, "b h w"],
+    reference: UInt8[np.ndarray, "b h w 3"],
+    differ: Bool[np.ndarray, "b h w"],
+    names: Sequence[str],
+) -> Figure:
     """Fast camera, mujoco.Renderer and the pixels in which their materials differ, a row a pose."""
     figure = Figure(figsize=(7, 2.35 * len(fast) + 0.4), layout="constrained")
     rows = figure.subplots(len(fast), 3, squeeze=False)

@@ -21,6 +21,7 @@ from lt_lib.report.claims import (
     SURROGATE,
     Claim,
     Finding,
+    Findings,
     verdict,
 )
 
@@ -88,13 +89,9 @@ def read_findings(outputs: Path, claims: Mapping[str, Claim], profile: str) -> d
             raise UserError(f"{notebook}.json: {name} belongs to {claims[name].nb}")
     for results in files:
         known = {*results.findings, *results.pending}
-        lacking = [
-            name for name, claim in claims.items() if claim.nb == results.notebook and name not in known
-        ]
+        lacking = [name for name, claim in claims.items() if claim.nb == results.notebook and name not in known]
         if lacking:
-            raise UserError(
-                f"{results.notebook}.json: no finding for {', '.join(lacking)}, which is not pending"
-            )
+            raise UserError(f"{results.notebook}.json: no finding for {', '.join(lacking)}, which is not pending")
     return {name: finding for results in files for name, finding in results.findings.items()}
 
 
@@ -228,6 +225,12 @@ def styled(rows: pd.DataFrame, board: pd.DataFrame, profile: str) -> Styler:
         .set_caption(stamp(board, profile))
         .set_properties(**{"text-align": "left"})
     )
+
+
+def own(findings: Findings) -> Styler:
+    """What one notebook found, for its own reader: its rows of the scoreboard."""
+    board = join(findings.claims, findings.found, findings.profile)
+    return styled(board[board.id.isin(findings.found)], board, findings.profile)
 
 
 def write(board: pd.DataFrame, findings: Mapping[str, Finding], outputs: Path, profile: str) -> None:

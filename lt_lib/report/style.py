@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from IPython.display import Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -20,8 +21,8 @@ def chance_line(axes: Axes, level: float = 0.5) -> None:
     axes.axhline(level, label="chance", **CHANCE)
 
 
-def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str) -> Figure:
-    """Says at the bottom what the figure is made of, stamps a smoke-sized one, and saves it as a PNG.
+def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str) -> Image:
+    """Says at the bottom what the figure is made of, stamps a smoke-sized one, saves it as a PNG and shows that.
 
     made_of  e.g. 'n = 5 seeds a condition, last 500 of 6,000 episodes'
     name     of the file in <outputs>/figures, e.g. '04_routes'
@@ -31,5 +32,6 @@ def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str)
         figure.text(0.5, 0.5, "SMOKE: not a result", rotation=20, fontsize=34, alpha=0.13, ha="center", va="center")
     folder = outputs / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.png", dpi=DPI)
-    return figure
+    path = folder / f"{name}.png"
+    figure.savefig(path, dpi=DPI)
+    return Image(filename=path)

@@ -1,0 +1,39 @@
+"""What can be known to be wrong with a notebook's parameters before anything is computed."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lt_lib.params import ROOT, UserError
+
+KINDS = ("encoder", "executor")  # what a weights folder holds
+
+
+def settled(parameters: Mapping[str, Any], root: Path = ROOT) -> dict[str, Any]:
+    """The parameters, with `weights` emptied where it names outputs of a profile that was never run.
+
+    An empty `weights` means to train. A folder elsewhere that does not exist is a mistake, and stays to be found.
+    """
+    folder = root / parameters.get("weights", "")
+    never_run = folder.is_relative_to(root / "outputs") and not folder.is_dir()
+    return dict(parameters) | ({"weights": ""} if never_run else {})
+
+
+def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
+    """Raises UserError, one line, for an impossible or revealing layout, unusable weights or an unknown condition."""
+    if "layout" in parameters:
+        from lt_lib.envs.layout import load_layout  # here, since the compiled camera takes seconds to import
+        from lt_lib.envs.occlusion import require_occlusion
+        from lt_lib.perception.weights import load_frozen
+
+        layout = load_layout(parameters["layout"])
+        require_occlusion(layout)
+        if parameters.get("weights"):
+            for kind in KINDS:
+                load_frozen(root / parameters["weights"], kind, layout)
+    if "seeds" in parameters:
+        from lt_lib.comm.messages import CONDITIONS
+
+        unknown = sorted(set(parameters["seeds"]) - set(CONDITIONS))
+        if unknown:
+            raise UserError(f"seeds: unknown message condition '{unknown[0]}'; there are {', '.join(CONDITIONS)}")

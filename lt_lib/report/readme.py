@@ -1,0 +1,24 @@
+"""Writes the headline table of the committed full run into README.md: `python -m lt_lib.report.readme`."""
+
+import re
+from pathlib import Path
+
+from lt_lib.params import ROOT
+from lt_lib.report.claims import load_claims
+from lt_lib.report.scoreboard import headline, join, read_findings, summary
+
+README = ROOT / "README.md"
+FULL = ROOT / "outputs" / "full"
+BLOCK = re.compile(r"(<!-- headline: begin.*?-->\n).*?(<!-- headline: end -->)", re.DOTALL)
+
+
+def refreshed(text: str, outputs: Path = FULL) -> str:
+    """The README's text with its headline block as the results of the full run have it."""
+    claims = load_claims()
+    board = join(claims, read_findings(outputs, claims, "full"), "full")
+    table = f"Route optimality by message content (Table III), mean over seeds [95% interval]:\n\n{headline(board)}\n\n"
+    return BLOCK.sub(lambda found: f"{found[1]}{table}All claims: {summary(board)}.\n{found[2]}", text)
+
+
+if __name__ == "__main__":
+    README.write_text(refreshed(README.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,53 @@
+"""What one control step costs, stage by stage, with the fast camera and with `mujoco.Renderer`, side by side."""
+
+import time
+
+import numpy as np
+import pandas as pd
+
+from lt_lib.envs.arena import Arena
+from lt_lib.envs.camera import FastCamera
+from lt_lib.envs.layout import Layout
+from lt_lib.envs.reference import ReferenceCamera
+from lt_lib.learners.episodes import draw_scenes
+from lt_lib.learners.executor import FrozenExecutor
+from lt_lib.perception.encoder import FrozenEncoder
+from lt_lib.runs import Result
+
+ENVS = 64  # scenes stepped side by side, as in training
+
+
+def step_costs(layout: Layout, encoder: Result, executor: Result, rounds: int = 7) -> pd.DataFrame:
+    """Microseconds of processor time a scene and control step: the median over rounds in which all stages take turns.
+
+    Processor time counts every thread, so these are the costs on one core. Columns: with either camera.
+    """
+    arena, frozen, driver = Arena(layout, ENVS), FrozenEncoder(encoder), FrozenExecutor(executor)
+    fast, reference, rng = FastCamera(layout), ReferenceCamera(layout), np.random.default_rng(0)
+    draws, route = draw_scenes(layout, ENVS, rng), rng.integers(0, 2, ENVS)
+    arena.reset(np.ones(ENVS, bool), draws.spawn, rng.integers(0, 2, ENVS), draws.scout)
+    seconds: dict[str, list[float]] = {}
+    for turn in range(rounds + 1):
+        view = (arena.pose, arena.slab, arena.scout[:, :2])
+        frames = _timed(seconds, "camera", turn, lambda view=view: fast.frames(*view))
+        _timed(seconds, "mujoco.Renderer", turn, lambda view=view: reference.pictures(*view))
+        latent = _timed(seconds, "encoder", turn, lambda frames=frames: frozen.latent(frames))
+        action = _timed(seconds, "policy", turn, lambda latent=latent: driver.mean_action(latent, route))
+        _timed(seconds, "physics", turn, lambda action=action: arena.step(action))
+    reference.close()
+    cost = {stage: np.median(values) / ENVS * 1e6 for stage, values in seconds.items()}
+    shared = {stage: cost[stage] for stage in ("physics", "encoder", "policy")}
+    table = pd.DataFrame({
+        "fast camera": {"camera": cost["camera"], **shared},
+        "mujoco.Renderer": {"camera": cost["mujoco.Renderer"], **shared},
+    })  # fmt: skip
+    table.loc["whole step"] = table.sum()
+    return table
+
+
+def _timed(seconds: dict[str, list[float]], stage: str, turn: int, call):
+    start = time.process_time()
+    result = call()
+    if turn:  # the first round warms up
+        seconds.setdefault(stage, []).append(time.process_time() - start)
+    return result

@@ -1,0 +1,88 @@
+"""The real notebooks, end to end, at smoke size: undisturbed, and killed in the middle and started again."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from lt_lib.params import ROOT, notebook_names
+from lt_lib.report.claims import load_claims
+
+COMMAND = [sys.executable, "run_all.py", "--profile", "smoke"]
+LIMIT_S = 600
+NEEDED = ("run_all.py", "requirements.txt", "lt_lib", "notebooks", "params")
+
+
+def run(root: Path) -> subprocess.CompletedProcess:
+    return subprocess.run(COMMAND, cwd=root, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+
+
+def journal(root: Path) -> list[str]:
+    """Keys of the finished runs, in the order of their finishing."""
+    path = root / "outputs" / "runs" / "journal.jsonl"
+    return [json.loads(line)["key"] for line in path.read_text().splitlines()] if path.exists() else []
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> Path:
+    """The smoke outputs of this very checkout; the notebooks' own tests find its runs done."""
+    finished = run(ROOT)
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    return ROOT / "outputs" / "smoke"
+
+
+def test_every_notebook_leaves_results_figures_and_an_executed_copy(undisturbed):
+    manifest = json.loads((undisturbed / "manifest.json").read_text())
+    for name in notebook_names():
+        assert manifest["notebooks"][name]["status"] == "ok"
+        executed = json.loads((undisturbed / "notebooks" / f"{name}.ipynb").read_text())
+        assert all(cell["outputs"] is not None for cell in executed["cells"] if cell["cell_type"] == "code")
+        assert str(ROOT) not in json.dumps([cell.get("outputs") for cell in executed["cells"]])
+    assert {"01", "02", "04", "07", "09"} <= {path.name[:2] for path in (undisturbed / "figures").iterdir()}
+
+
+def test_the_scoreboard_has_every_claim_once_and_gives_no_verdict_at_smoke_size(undisturbed):
+    board = pd.read_csv(undisturbed / "scoreboard.csv", keep_default_na=False)
+    columns = ["id", "notebook", "what", "kind", "paper", "ours", "low", "high", "n", "test", "p", "verdict"]
+    assert list(board.columns) == columns
+    assert list(board.id) == list(load_claims())
+    assert set(board.verdict) <= {"", "not run"}
+    made = board[board.notebook.isin(["01_occlusion_check", "02_encoder"])]
+    assert (made.ours != "").all()
+    assert "smoke" in (undisturbed / "scoreboard.md").read_text().lower()
+
+
+def test_settings_are_the_paper_s(undisturbed):
+    board = pd.read_csv(undisturbed / "scoreboard.csv", keep_default_na=False).set_index("id")
+    fixed = board[board.index.str.startswith(("cfg.", "wire.")) & (board.index != "wire.ratio")]
+    assert len(fixed) == 12
+    assert (fixed.ours.astype(str) == fixed.paper.astype(str)).all(), fixed[["paper", "ours"]]
+
+
+def test_killed_in_a_training_and_started_again_it_ends_with_the_same_scoreboard(undisturbed, tmp_path):
+    for name in NEEDED:
+        source = ROOT / name
+        (shutil.copytree if source.is_dir() else shutil.copy2)(source, tmp_path / name)
+    first = subprocess.Popen(COMMAND, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    inflight = tmp_path / "outputs" / "runs" / "inflight"
+    deadline = time.time() + LIMIT_S
+    while len(journal(tmp_path)) < 8 or all(path.name.startswith("stage") for path in inflight.glob("*.json")):
+        assert first.poll() is None and time.time() < deadline
+        time.sleep(0.02)
+    os.kill(first.pid, signal.SIGKILL)
+    first.wait()
+    before = journal(tmp_path)
+    again = run(tmp_path)
+    assert again.returncode == 0, again.stdout + again.stderr
+    after = journal(tmp_path)
+    assert after[: len(before)] == before and len(after) > len(before)
+    assert len(set(after)) == len(after)  # no finished run was repeated
+    board = (tmp_path / "outputs" / "smoke" / "scoreboard.csv").read_bytes()
+    assert board == (undisturbed / "scoreboard.csv").read_bytes()
