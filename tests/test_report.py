@@ -1,4 +1,4 @@
-"""Statistics against closed forms, literal loops and the paper; claims, verdicts and the scoreboard on made-up results."""
+"""Statistics against closed forms, loops and the paper; claims, verdicts and the scoreboard on made-up results."""
 
 import csv
 import io

@@ -276,9 +276,15 @@ def changed(**changes):
 
 NARROW = [{"x": [-1.5, 0.6], "y": [1.15, 1.4]}, *DEFAULT["corridors"]["left"]["legs"][1:]]
 BAD = {
-    "narrow": ({"corridors.left.legs": NARROW}, r"corridors.left.legs\[0\] is 0.25 m wide, narrower than the robot \(0.30 m\)"),
+    "narrow": (
+        {"corridors.left.legs": NARROW},
+        r"corridors.left.legs\[0\] is 0.25 m wide, narrower than the robot \(0.30 m\)",
+    ),
     "scout in a wall": ({"scout.x": 1.1, "scout.y": 1.0}, r"scout at \(1.1, 1.0\) stands in a wall"),
-    "choice point in a wall": ({"choice_points": [{"x": -1.0, "y": 0.0, "heading": 0.0}] * 2}, r"choice_points\[0\] at .* stands in a wall"),
+    "choice point in a wall": (
+        {"choice_points": [{"x": -1.0, "y": 0.0, "heading": 0.0}] * 2},
+        r"choice_points\[0\] at .* stands in a wall",
+    ),
     "goal outside": ({"goal.x": 9.0}, r"goal at \(9.0, 0.0\) stands in a wall"),
     "unknown key": ({"slabs": 3}, "slabs: "),
     "missing key": ({"camera.fov": None}, "camera.fov: "),

@@ -58,7 +58,7 @@ class Arena:
         slab: Int[np.ndarray, " n"],
         scout: Float[np.ndarray, "n 3"],
     ):
-        """Starts new episodes in the scenes of `which`: navigator and scout poses, blocked corridor (0 left, 1 right)."""
+        """New episodes in the scenes of `which`: navigator and scout poses, blocked corridor (0 left, 1 right)."""
         self._qpos[which], self._qvel[which], self._warm[which] = pose[which], 0.0, 0.0
         self.slab[which], self.scout[which] = slab[which], scout[which]
         self._mocap[which, 0, :2] = self._slab_centre[slab[which]]

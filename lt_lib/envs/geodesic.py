@@ -1,4 +1,4 @@
-"""Walking distance to the goal through one corridor: the potential that pretrains the executor (Section Implementation)."""
+"""Walking distance to the goal through one corridor: the executor's potential (Section Implementation)."""
 
 import numpy as np
 from jaxtyping import Float

@@ -118,13 +118,15 @@ def scene_xml(layout: Layout, pixels: int) -> str:
     <geom name="pad" type="cylinder" pos="{layout.goal.x} {layout.goal.y} 0.01" group="{FROM_ABOVE}"
           size="{layout.goal.radius} 0.01" rgba="0.5 0.8 0.5 1"/>
     <body name="slab" mocap="true">{_faces("slab", centred)}
-      <geom name="slab_z:0" type="box" pos="0 0 {slab.height - FACE / 2}" size="{sx / 2} {sy / 2} {FACE / 2}" {_rgba("slab_z")}/>
+      <geom name="slab_z:0" type="box" pos="0 0 {slab.height - FACE / 2}"
+            size="{sx / 2} {sy / 2} {FACE / 2}" {_rgba("slab_z")}/>
     </body>
     <body name="scout" mocap="true">{_robot(layout, "robot:0", SCOUT, "robot")}</body>
     <body name="navigator" mocap="true" pos="0 0 {camera.height}">
       <camera name="eye" fovy="{camera.fov}" xyaxes="0 -1 0 0 0 1"/>
       {_robot(layout, "self", NAVIGATOR, "robot", -camera.height)}
-      <geom name="nose" type="box" pos="{layout.robot.radius} 0 0.12" size="0.08 0.04 0.02" group="{NAVIGATOR}" rgba="0.1 0.1 0.1 1"/>
+      <geom name="nose" type="box" pos="{layout.robot.radius} 0 0.12" size="0.08 0.04 0.02" group="{NAVIGATOR}"
+            rgba="0.1 0.1 0.1 1"/>
     </body>
   </worldbody>
 </mujoco>"""

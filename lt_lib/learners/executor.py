@@ -1,4 +1,4 @@
-"""The low-level controller: drives a commanded route from the navigator's own camera (Sections Route head, Implementation).
+"""The low-level controller: drives a commanded route from the navigator's own camera (Section Route head).
 
 It sees its latent and the route, never a message. It is pretrained by PPO with route-conditioned potential shaping
 and obedience as success, then frozen.

@@ -68,7 +68,7 @@ class Protocol:
         return cls(RunStore(ROOT / "outputs" / "runs", workers), shards=shards, weights=folder, **configs)
 
     def encoders(self) -> dict[str, Result]:
-        """Ours, and what the objective must beat at the gates: an untrained one, and one trained by prediction alone."""
+        """Ours, and what it must beat at the gates: an untrained one, and one trained by prediction alone."""
         alone = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
         configs = {
             "ours": self.encoder,

@@ -42,7 +42,7 @@ def sent_wires(
     spawn: Float[np.ndarray, "e 3"],
     scout: Float[np.ndarray, "e 3"],
 ) -> Float[Tensor, "e slab w"]:
-    """What reaches the navigator at the commit step, under either placement: the scout sends what it sees one step earlier."""
+    """What reaches the navigator at the commit step, under either placement; the scout saw it one step earlier."""
     camera, wires = FastCamera(layout), []
     for slab in range(SLABS):
         slabs = np.full(len(spawn), slab)

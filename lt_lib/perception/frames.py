@@ -1,4 +1,4 @@
-"""Frames for the encoder: random rollouts from uniform free poses, without labels or reward (Section Implementation)."""
+"""Frames for the encoder: random rollouts from uniform free poses, no labels, no reward (Section Implementation)."""
 
 from typing import NamedTuple
 

@@ -55,10 +55,10 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
         raise UserError(f"weights: {path} holds a {found[0]} of format {found[1]}, not a {kind} of format {FORMAT}")
     if hashlib.sha256(payload).hexdigest() != found[2]:
         raise UserError(
-            f"weights: {path} is truncated or altered (its checksum differs from {sidecar_path.name}'s); freeze it again"
+            f"weights: {path} is truncated or altered (checksum differs from {sidecar_path.name}'s); freeze it again"
         )
     if Layout(**found[3]) != layout:
         raise UserError(
-            f"weights: {path} was trained in another scene than layout '{layout.name}'; train it there, or use its layout"
+            f"weights: {path} was trained in another scene than layout '{layout.name}'; train it there or use its own"
         )
     return safetensors.numpy.load(payload)

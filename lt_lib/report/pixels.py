@@ -28,7 +28,7 @@ def collapsed(head: Result) -> bool:
 
 
 def judge(name: str, shares: np.ndarray, floor: np.ndarray, latent: np.ndarray) -> dict[str, Any]:
-    """One cell of Table III as a finding: value, seeds, interval, and the test that its role in the comparison calls for.
+    """One cell of Table III as a finding: value, seeds, interval, and the test that its role calls for.
 
     ours, diagnostic       above the floor, exact one-sided rank test
     lower bound, kinematic  at chance, equivalence within +- 0.1

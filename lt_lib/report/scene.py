@@ -1,4 +1,4 @@
-"""Pictures of the scene: Fig. 1, from where the slab can be seen, the layout that leaks, and the two cameras compared."""
+"""Pictures of the scene: Fig. 1, from where the slab can be seen, the layout that leaks, the two cameras compared."""
 
 from collections.abc import Mapping, Sequence
 
