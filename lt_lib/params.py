@@ -290,6 +290,7 @@ SECTIONS: dict[str, Any] = {
     "head": HeadConfig,
     "seeds": dict[str, PositiveInt],
     "shards": PositiveInt,
+    "more_seeds": PositiveInt,
     "latent_heads": PositiveInt,
     "episodes": PositiveInt,
     "device": Device,

@@ -28,9 +28,9 @@ from lt_lib.params import (
     Training,
     UserError,
 )  # fmt: skip
-from lt_lib.perception.gates import measure_gates, require_gates
+from lt_lib.perception.gates import Measured, measure_gates, require_gates
 from lt_lib.perception.jepa import train_encoder
-from lt_lib.perception.weights import load_frozen, save_frozen
+from lt_lib.perception.weights import facts_of, load_frozen, save_frozen
 from lt_lib.runs import Result, Run, RunStore
 
 SEED = 0  # of the one encoder and the one executor, as in the paper; heads have seeds of their own
@@ -105,15 +105,16 @@ class Protocol:
             return self._kept("executor")
         return self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
 
+    def encoder_facts(self, report: Result) -> dict:
+        """What goes with the frozen encoder: the settings it was trained with and what it showed at the gates."""
+        if self.weights:
+            return facts_of(self.weights, "encoder")
+        return {"settings": self.encoder.model_dump(), "gates": {name: report[name] for name in Measured._fields}}
+
     def save_executor(self, executor: Result, folder: Path) -> Path:
         """Keeps the frozen executor beside the frozen encoder."""
-        return save_frozen(
-            folder,
-            "executor",
-            executor,
-            load_layout(self.executor.layout),
-            {"settings": self.executor.model_dump()},
-        )
+        facts = facts_of(self.weights, "executor") if self.weights else {"settings": self.executor.model_dump()}
+        return save_frozen(folder, "executor", executor, load_layout(self.executor.layout), facts)
 
     def episode_bank(self, encoder: Result, executor: Result) -> Result:
         """Every outcome of `shards` times `bank.entries` draws of the scene; arrays (entries, slab, route)."""

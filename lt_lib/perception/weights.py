@@ -62,3 +62,9 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
             f"weights: {path} was trained in another scene than layout '{layout.name}'; train it there or use its own"
         )
     return safetensors.numpy.load(payload)
+
+
+def facts_of(folder: Path, kind: str) -> dict:
+    """What was recorded with frozen weights that `load_frozen` has accepted: their settings and what they passed."""
+    sidecar = json.loads((folder / f"{kind}.json").read_text(encoding="utf-8"))
+    return {name: value for name, value in sidecar.items() if name not in ("format", "kind", "sha256", "layout")}
