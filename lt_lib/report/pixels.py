@@ -50,7 +50,7 @@ def judge(name: str, shares: np.ndarray, floor: np.ndarray, latent: np.ndarray) 
                 "test": "exact rank test, latent above it; holds if no better",
                 "p": p,
                 "holds": bool(shares.mean() <= latent.mean()),
-                "note": f"{(shares >= SOLVED).sum()} of {len(shares)} seeds solved, 2 of 3 in the paper; so few decide the mean",
+                "note": f"{(shares >= SOLVED).sum()} of {len(shares)} seeds solved, the paper's 2 of 3 decide its mean",
             }
     p = stats.chance_equivalence(shares)
     return finding | {"test": "equivalence with chance +- 0.1 (TOST)", "p": p, "holds": p < ALPHA}
