@@ -1,0 +1,59 @@
+"""The house itself: imports point one way, notebooks are prose without outputs, the README is not stale."""
+
+import ast
+import json
+
+import pytest
+
+from lt_lib.params import ROOT, notebook_names
+from lt_lib.report.readme import FULL, README, refreshed
+
+FLOORS = {"params": 0, "runs": 0, "envs": 1, "perception": 2, "comm": 2, "learners": 3, "report": 3}
+LONGEST_CELL = 16
+LONGEST_FUNCTION = 60
+
+
+def modules():
+    return sorted((ROOT / "lt_lib").rglob("*.py"))
+
+
+def imports(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lt_lib."):
+            yield node.module.split(".")[1]
+
+
+def test_imports_point_down_or_sideways():
+    seen = 0
+    for path in modules():
+        here = FLOORS.get(path.relative_to(ROOT / "lt_lib").parts[0].removesuffix(".py"))
+        for there in imports(path):
+            seen += 1
+            assert here is None or FLOORS.get(there, 0) <= here, f"{path.name} imports {there}, which lies above it"
+    assert seen > 50
+
+
+def test_no_function_is_long():
+    for path in [*modules(), ROOT / "run_all.py"]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                assert node.end_lineno - node.lineno < LONGEST_FUNCTION, f"{path.name}: {node.name}"
+
+
+@pytest.mark.parametrize("name", notebook_names())
+def test_source_notebooks_are_short_cells_of_calls_without_outputs(name):
+    notebook = json.loads((ROOT / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))
+    assert notebook["metadata"]["kernelspec"]["name"] == "python3"
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert sum("parameters" in cell["metadata"].get("tags", []) for cell in code) == 1
+    for cell in code:
+        lines = "".join(cell["source"]).splitlines()
+        assert not cell["outputs"] and cell["execution_count"] is None
+        assert len(lines) <= LONGEST_CELL
+        assert not any(line.startswith(("def ", "class ")) for line in lines)
+
+
+@pytest.mark.skipif(not (FULL / "scoreboard.csv").exists(), reason="no full run is committed")
+def test_the_readme_s_headline_is_that_of_the_committed_full_run():
+    text = README.read_text(encoding="utf-8")
+    assert refreshed(text) == text, "stale: run python -m lt_lib.report.readme"
