@@ -63,12 +63,13 @@ def judge(rows: Rows, wire: str) -> dict[str, Any]:
         return finding
     counts = [(row["intact"]["optimal"].sum(), row[wire]["optimal"].sum(), row[wire]["optimal"].size) for row in rows]
     p = max(stats.drop_test(*count) for count in counts)
-    low, high = AT_CHANCE
+    (low, high), spread = AT_CHANCE, 1.96 * 0.5 / np.sqrt(counts[0][2])
     holds = bool(p < ALPHA and low <= cell.min() and cell.max() <= high)
     return finding | {
         "test": "Fisher exact drop from intact, largest p of the heads; each within 0.35 to 0.65",
         "p": p,
         "holds": holds,
+        "note": f"at chance a head's episodes alone scatter by ±{spread:.2f}",
     }
 
 
