@@ -13,6 +13,7 @@ from lt_lib.envs.camera import FastCamera, colours, network_input
 from lt_lib.envs.fidelity import agreement
 from lt_lib.envs.geodesic import MARGIN, RESOLUTION, RouteDistance
 from lt_lib.envs.layout import Layout, load_layout
+from lt_lib.envs.materials import INDEX
 from lt_lib.envs.occlusion import occlusion, require_occlusion, sight_map
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.learners.episodes import draw_scenes, drive
@@ -51,6 +52,11 @@ def test_fast_camera_agrees_with_mujoco_at_random_poses(slab_height, poses):
     assert found.flags == 1
     assert found.grey_levels <= 2
     assert found.frames == poses
+
+
+def test_a_ray_exactly_along_an_axis_is_drawn_like_its_neighbours(layout):
+    eye, other = np.array([[-3.0, 0.0, 0.0]]), np.array([[2.3, 0.0]])  # one pixel: its ray has no y component at all
+    assert FastCamera(layout, 1).frames(eye, [0], other).item() == INDEX["barrier_x"]
 
 
 def test_network_input_is_the_colours_over_255(layout):
