@@ -24,7 +24,7 @@ def final_shares(heads: Sequence[Result], name: str, last: int = 500) -> np.ndar
 
 def collapsed(head: Result) -> bool:
     """Whether a head stopped exploring and stayed at chance."""
-    return bool(head["entropy"][-1] < COLLAPSED and head["optimal"][-500:].mean() < SOLVED)
+    return bool(head["entropy"][-1] < COLLAPSED and final_shares([head], "optimal")[0] < SOLVED)
 
 
 def judge(name: str, shares: np.ndarray, floor: np.ndarray, latent: np.ndarray) -> dict[str, Any]:
