@@ -280,6 +280,51 @@ class EvaluationConfig(Training):
     episodes: PositiveInt = 256
 
 
+class PatchEncoderConfig(EncoderConfig):
+    """Stage 1 in the gridworld, which has about a hundred views where the pixels have any number."""
+
+    layout: str = "grid"
+    variance: NonNegativeFloat = 1.0
+    covariance: NonNegativeFloat = 0.1
+
+
+class PatchGateConfig(Training):
+    """How the gridworld's freeze gates are measured: cross-validation over cells, so many folds."""
+
+    layout: str = "grid"
+    folds: Annotated[int, Field(ge=2)] = 10
+
+
+class PatchGates(Settings):
+    """The gridworld's pre-registered thresholds."""
+
+    hazard: Share = 0.9
+    share: Share = 0.12
+    rank: NonNegativeFloat = 20.0
+
+
+class GridConfig(Training):
+    """The gridworld's receiver, trained by MAPPO (Sections Implementation, Gridworld)."""
+
+    layout: str = "grid"
+    content: str = "latent"  # a name in comm.grid_wires.GRID_CONTENTS
+    steps: PositiveInt = 1_200_000
+    envs: PositiveInt = 64
+    rollout: PositiveInt = 512  # steps an environment and update
+    minibatch: PositiveInt = 1_024
+    lr: PositiveFloat = 1e-3
+    ppo: PpoConfig = PpoConfig()
+
+
+class GridEvaluationConfig(Training):
+    """A frozen policy of the gridworld under one wire condition."""
+
+    layout: str = "grid"
+    content: str
+    wire: str  # a name in comm.channel.CORRUPTIONS
+    episodes: PositiveInt = 256
+
+
 # How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
 SECTIONS: dict[str, Any] = {
     "encoder": EncoderConfig,
@@ -288,6 +333,9 @@ SECTIONS: dict[str, Any] = {
     "executor": ExecutorConfig,
     "bank": BankConfig,
     "head": HeadConfig,
+    "grid_encoder": PatchEncoderConfig,
+    "grid_gates": PatchGates,
+    "grid": GridConfig,
     "seeds": dict[str, PositiveInt],
     "shards": PositiveInt,
     "more_seeds": PositiveInt,

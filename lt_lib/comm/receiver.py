@@ -1,0 +1,37 @@
+"""The receiver: one cross-attention layer from the navigator to the messages it got (Section Receiver)."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+
+class Receiver(nn.Module):
+    """Masked attention over any number of senders: the ego embedding asks, the messages are keys and values.
+
+    The pooled message does not depend on the senders' order, and a sender that is absent contributes exactly zero, as
+    do all of them together. The value projection has no bias and starts at zero, so that every condition starts as the
+    no-message policy. With one sender the attention is 1 whatever the scores, and query and key get no gradient.
+    """
+
+    def __init__(self, ego: int, wire: int, pooled: int):
+        super().__init__()
+        self.query, self.key = nn.Linear(ego, pooled, bias=False), nn.Linear(wire, pooled, bias=False)
+        self.value = nn.Linear(wire, pooled, bias=False)
+        nn.init.zeros_(self.value.weight)
+
+    def forward(
+        self, ego: Float[Tensor, "b e"], wires: Float[Tensor, "b n w"], present: Bool[Tensor, "b n"]
+    ) -> Float[Tensor, "b d"]:
+        """The pooled messages of n senders."""
+        weights = self.attention(ego, wires, present)
+        return (weights.unsqueeze(1) @ self.value(wires)).squeeze(1)
+
+    def attention(
+        self, ego: Float[Tensor, "b e"], wires: Float[Tensor, "b n w"], present: Bool[Tensor, "b n"]
+    ) -> Float[Tensor, "b n"]:
+        """How much of each sender is read: a softmax over those present, zero for the others."""
+        keys = self.key(wires)
+        scores = (keys @ self.query(ego).unsqueeze(2)).squeeze(2) / keys.shape[-1] ** 0.5
+        # a row without any sender has no softmax; the finite fill keeps it, and its gradient, from becoming NaN
+        scores = scores.masked_fill(~present, torch.finfo(scores.dtype).min)
+        return scores.softmax(dim=1) * present
