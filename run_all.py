@@ -27,11 +27,11 @@ from lt_lib.preflight import check_inputs, settled
 from lt_lib.progress import Progress, read_progress
 
 # Without these the later notebook can only fail too; the scoreboard joins whatever is there.
-NEEDS = {"04_pixels": ("02_encoder",), "07_corruption": ("04_pixels",)}
+NEEDS = {"04_pixels": ("02_encoder",), "07_corruption": ("03_gridworld", "04_pixels")}
 # What this script gives to every notebook, over what the profile says.
 GIVEN = ("profile", "outputs", "workers")
 # What names things that may not exist or not fit; checked before computing.
-INPUTS = ("layout", "weights", "seeds")
+INPUTS = ("layout", "weights", "seeds", "grid_layout", "peek_layout", "grid_seeds")
 CELL_LIMIT_S = 6 * 3600
 
 

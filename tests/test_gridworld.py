@@ -280,7 +280,7 @@ def test_the_table_gives_the_gradients_of_the_plain_masked_update_over_both_robo
     walks, _ = walk(GRID, log_probs.exp().numpy(), first_states(GRID, 8, rng), 40, rng)
     rows, sampled = batch(log_probs, values, walks, config)
     with torch.no_grad():
-        team.actor.logits.bias += torch.tensor([0.5, -0.3, 0.1, 0.0, -0.4])  # so that ratios differ from 1, some beyond the clip
+        team.actor.logits.bias += torch.tensor([0.5, -0.3, 0.1, 0.0, -0.4])  # some ratios beyond the clip
     optimiser = torch.optim.SGD(team.parameters(), lr=1.0)
     before = [p.detach().clone() for p in team.parameters()]
     once = config.model_copy(update={"epochs": 1})

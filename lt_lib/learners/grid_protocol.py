@@ -62,22 +62,33 @@ class GridProtocol:
 
     def frozen_encoder(self) -> Result:
         """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
-        (trained,) = self.store.fetch([Run(train_patch_encoder, self.encoder, SEED)], "patch encoder")
+        trained = self.trained_encoder()
         require_patch_gates(self.gate_reports({OURS: trained})[OURS], self.gates)
         return trained
+
+    def trained_encoder(self) -> Result:
+        """Stage 1 without its gates."""
+        return self.store.fetch([Run(train_patch_encoder, self.encoder, SEED)], "patch encoder")[0]
 
     def trained(self, seeds: Mapping[str, int], encoder: Result) -> dict[str, list[Result]]:
         """Stage 2: so many seeds of each content, all with the same settings. Raises UserError for an unknown one."""
         for content in seeds:
             if content not in GRID_CONTENTS:
                 raise UserError(f"unknown message content '{content}'; known: {', '.join(GRID_CONTENTS)}")
+        return self._fetch({content: (content, count, encoder) for content, count in seeds.items()})
+
+    def ablated(self, encoders: Mapping[str, Result], seeds: int) -> dict[str, list[Result]]:
+        """Stage 2 for the latent of each of several encoders."""
+        return self._fetch({name: ("latent", seeds, encoder) for name, encoder in encoders.items()})
+
+    def _fetch(self, wanted: Mapping[str, tuple[str, int, Result]]) -> dict[str, list[Result]]:
         runs = {
-            (content, seed): Run(train_grid, self._trained_on(content), seed, {"encoder": _frozen(encoder)})
-            for content, count in seeds.items()
+            (name, seed): Run(train_grid, self._trained_on(content), seed, {"encoder": _frozen(encoder)})
+            for name, (content, count, encoder) in wanted.items()
             for seed in range(count)
         }
         results = dict(zip(runs, self.store.fetch(list(runs.values()), "gridworld policies"), strict=True))
-        return {content: [results[content, seed] for seed in range(count)] for content, count in seeds.items()}
+        return {name: [results[name, seed] for seed in range(count)] for name, (_, count, _) in wanted.items()}
 
     def corrupted(
         self, policies: Mapping[str, list[Result]], episodes: int, encoder: Result

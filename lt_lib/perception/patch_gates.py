@@ -48,13 +48,13 @@ def measure_patch_gates(
     cells = np.repeat(walked, len(SIDES))
     folds = GroupKFold(config.folds, shuffle=True, random_state=seed)
     scores = cross_val_score(LogisticRegression(max_iter=5000), latents, visible, groups=cells, cv=folds)
-    low, high = t.interval(0.95, len(scores) - 1, loc=scores.mean(), scale=scores.std(ddof=1) / np.sqrt(len(scores)))
+    half = t.ppf(0.975, len(scores) - 1) * scores.std(ddof=1) / np.sqrt(len(scores))
     moved = latents.reshape(-1, len(SIDES), LATENT)[grid.revealing[walked]]
     between = np.square((moved[:, 0] - moved[:, 1]) / 2).sum(1).mean()
     found = PatchesMeasured(
         float(scores.mean()),
-        float(max(low, 0.0)),
-        float(min(high, 1.0)),
+        float(max(scores.mean() - half, 0.0)),
+        float(min(scores.mean() + half, 1.0)),
         float(max(visible.mean(), 1 - visible.mean())),
         float(between / latents.var(0).sum()),
         effective_rank(latents),

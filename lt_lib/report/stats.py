@@ -78,3 +78,9 @@ def drop_test(intact_successes: SupportsIndex, corrupted_successes: SupportsInde
     """One-sided Fisher exact p that corruption lowers a head's success, n episodes a cell (Table IV)."""
     table = [[index(s), index(n) - index(s)] for s in (intact_successes, corrupted_successes)]
     return float(stats.fisher_exact(table, alternative="greater").pvalue)
+
+
+def same_share(one: tuple[SupportsIndex, SupportsIndex], other: tuple[SupportsIndex, SupportsIndex]) -> float:
+    """Two-sided Fisher exact p that two counts (successes, n) have one share."""
+    table = [[index(s), index(n) - index(s)] for s, n in (one, other)]
+    return float(stats.fisher_exact(table).pvalue)
