@@ -31,7 +31,7 @@ NEEDS = {"04_pixels": ("02_encoder",), "07_corruption": ("03_gridworld", "04_pix
 # What this script gives to every notebook, over what the profile says.
 GIVEN = ("profile", "outputs", "workers")
 # What names things that may not exist or not fit; checked before computing.
-INPUTS = ("layout", "weights", "seeds", "grid_layout", "peek_layout", "grid_seeds")
+INPUTS = ("layout", "weights", "seeds", "gridworld", "peek_layout")
 CELL_LIMIT_S = 6 * 3600
 
 

@@ -153,6 +153,8 @@ def explain(error: ValidationError, name: str, settings: Any) -> str:
     first = error.errors()[0]
     place = ".".join([name, *map(str, first["loc"])])
     if first["type"] == "extra_forbidden":
+        for part in first["loc"][:-1]:  # settings inside settings
+            settings, name = settings.model_fields[part].annotation, f"{name}.{part}"
         return f"{place}: unknown parameter; {name} has {_listed(settings.model_fields)}"
     complaint = first["msg"].replace("Input should be", "must be")
     return f"{place}: {complaint}, got {first['input']!r}"
@@ -325,6 +327,16 @@ class GridEvaluationConfig(Training):
     episodes: PositiveInt = 256
 
 
+class GridworldConfig(Settings):
+    """All that the gridworld's protocol needs, in one parameter; every stage takes the section's layout."""
+
+    layout: str = "grid"
+    encoder: PatchEncoderConfig = PatchEncoderConfig()
+    gates: PatchGates = PatchGates()
+    policy: GridConfig = GridConfig()
+    seeds: dict[str, PositiveInt]  # how many of each content
+
+
 # How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
 SECTIONS: dict[str, Any] = {
     "encoder": EncoderConfig,
@@ -333,10 +345,7 @@ SECTIONS: dict[str, Any] = {
     "executor": ExecutorConfig,
     "bank": BankConfig,
     "head": HeadConfig,
-    "grid_encoder": PatchEncoderConfig,
-    "grid_gates": PatchGates,
-    "grid": GridConfig,
-    "grid_seeds": dict[str, PositiveInt],
+    "gridworld": GridworldConfig,
     "peek_seeds": dict[str, PositiveInt],
     "ablation_seeds": PositiveInt,
     "seeds": dict[str, PositiveInt],

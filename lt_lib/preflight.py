@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lt_lib.params import ROOT, UserError
+from lt_lib.params import ROOT, GridworldConfig, UserError
 
 KINDS = ("encoder", "executor")  # what a weights folder holds
 
@@ -37,19 +37,22 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
         unknown = sorted(set(parameters["seeds"]) - set(CONDITIONS))
         if unknown:
             raise UserError(f"seeds: unknown message condition '{unknown[0]}'; there are {', '.join(CONDITIONS)}")
-    if "grid_layout" in parameters:
-        _check_grid(parameters)
+    if "gridworld" in parameters:
+        _check_gridworld(parameters)
 
 
-def _check_grid(parameters: Mapping[str, Any]) -> None:
+def _check_gridworld(parameters: Mapping[str, Any]) -> None:
     from lt_lib.comm.grid_wires import GRID_CONTENTS
     from lt_lib.envs.gridworld import Grid
     from lt_lib.envs.layout import load_layout
     from lt_lib.envs.occlusion import require_occluded_choices
 
-    require_occluded_choices(Grid(load_layout(parameters["grid_layout"])))
+    gridworld = GridworldConfig(**parameters["gridworld"])
+    require_occluded_choices(Grid(load_layout(gridworld.layout)))
     if "peek_layout" in parameters:
         Grid(load_layout(parameters["peek_layout"]))
-    unknown = sorted(set(parameters.get("grid_seeds", {})) - set(GRID_CONTENTS))
+    unknown = sorted(set(gridworld.seeds) - set(GRID_CONTENTS))
     if unknown:
-        raise UserError(f"grid_seeds: unknown message content '{unknown[0]}'; there are {', '.join(GRID_CONTENTS)}")
+        raise UserError(
+            f"gridworld.seeds: unknown message content '{unknown[0]}'; there are {', '.join(GRID_CONTENTS)}"
+        )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from pydantic import ValidationError
 
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.grid_wires import GRID_CONTENTS, contents_sent
@@ -23,16 +24,20 @@ from lt_lib.learners.mappo import Actor, Inputs, TableTeam, Team, batch, train_g
 from lt_lib.params import (
     GridConfig,
     GridEvaluationConfig,
+    GridworldConfig,
     PatchEncoderConfig,
     PatchGateConfig,
     PatchGates,
     PpoConfig,
     UserError,
+    explain,
     layout_path,
 )  # fmt: skip
 from lt_lib.perception.gates import GateError
 from lt_lib.perception.patch_gates import measure_patch_gates, require_patch_gates
 from lt_lib.perception.patches import FrozenPatchEncoder, random_walks, train_patch_encoder
+from lt_lib.preflight import check_inputs
+from lt_lib.report import grid_corruption
 from lt_lib.runs import RunStore
 
 GRID = Grid(load_layout("grid"))
@@ -401,3 +406,56 @@ def test_an_unknown_content_is_refused_before_anything_is_computed(tmp_path, enc
 def test_the_observation_has_225_cells():
     assert PATCH**2 == 225 and GRID.patches.shape[2:] == (15, 15)
     assert Actor(2 + 225).receiver.value.weight.shape == (64, 227)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"gridworld": {"layout": "default", "seeds": {}}}, "off the grid of 0.5 m cells"),
+        (
+            {"gridworld": {"layout": "grid_peek", "seeds": {}}},
+            r"from the choice cell at \(-1.75, 0.5\) m the placements",
+        ),
+        ({"gridworld": {"seeds": {}}, "peek_layout": "nowhere"}, "unknown layout 'nowhere'"),
+        ({"gridworld": {"seeds": {"telepathy": 5}}}, "gridworld.seeds: unknown message content 'telepathy'"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_runs(parameters, words):
+    with pytest.raises(UserError, match=words) as error:
+        check_inputs(parameters)
+    assert "\n" not in str(error.value)
+
+
+# --- judgements
+
+
+def played(success: dict[str, float], rerouted: float = 0.0) -> dict[str, dict]:
+    """A policy's 100 episodes under every wire condition; what is not named succeeds as with the wire intact."""
+    shares = dict.fromkeys(CORRUPTIONS, success["intact"]) | success
+    return {
+        wire: {"sampled.success": np.arange(100) < 100 * share, "sampled.rerouted": np.arange(100) < 100 * rerouted}
+        for wire, share in shares.items()
+    }
+
+
+def trained(success: float) -> dict:
+    return {"success": np.arange(500) < 500 * success}
+
+
+def test_who_falls_who_peeks_and_who_must_not_change_are_told_apart():
+    reads = played({"intact": 1.0} | dict.fromkeys(grid_corruption.DESTROYED, 0.4))
+    peeks, deaf = played({"intact": 1.0}, rerouted=0.5), played({"intact": 0.5})
+    policies = {"latent": [trained(1.0)] * 2, "raw": [trained(1.0)], "floor": [trained(0.5)]}
+    judged = grid_corruption.judge(policies, {"latent": [reads, reads], "raw": [peeks], "floor": [deaf]})
+    assert judged["grid.corrupt"]["value"] == "2 of 3" and judged["grid.peek"]["value"] == 1
+    assert judged["grid.invariant"]["value"] == "all" and judged["grid.invariant"]["n"] == 1
+    moved = played({"intact": 0.5, "wire_zeroed": 0.8})
+    judged = grid_corruption.judge(policies, {"latent": [reads, reads], "raw": [peeks], "floor": [moved]})
+    assert judged["grid.invariant"]["value"] == "not all" and not judged["grid.invariant"]["holds"]
+
+
+def test_an_unknown_setting_inside_a_section_is_named_with_its_neighbours():
+    with pytest.raises(ValidationError) as error:
+        GridworldConfig(policy={"step": 3}, seeds={})
+    told = explain(error.value, "gridworld", GridworldConfig)
+    assert told.startswith("gridworld.policy.step: unknown parameter; gridworld.policy has content, device, envs")

@@ -11,6 +11,7 @@ from lt_lib.params import (
     ROOT,
     GridConfig,
     GridEvaluationConfig,
+    GridworldConfig,
     PatchEncoderConfig,
     PatchGateConfig,
     PatchGates,
@@ -34,13 +35,15 @@ class GridProtocol:
     grid: GridConfig
 
     @classmethod
-    def of(cls, layout: str, workers: int, encoder: Mapping, gates: Mapping, grid: Mapping) -> "GridProtocol":
+    def of(cls, gridworld: Mapping, workers: int) -> "GridProtocol":
         """From a notebook's parameters."""
+        section = GridworldConfig(**gridworld)
+        there = {"layout": section.layout}
         return cls(
             RunStore(ROOT / "outputs" / "runs", workers),
-            PatchEncoderConfig(layout=layout, **encoder),
-            PatchGates(**gates),
-            GridConfig(layout=layout, **grid),
+            section.encoder.model_copy(update=there),
+            section.gates,
+            section.policy.model_copy(update=there),
         )
 
     def encoders(self) -> dict[str, Result]:

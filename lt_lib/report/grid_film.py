@@ -71,7 +71,7 @@ def _picture(grid: Grid, inputs: Inputs, actor: Actor, state: Sequence[int], ste
     acts.set_yticks(places, ARROWS, fontsize=8)
     acts.set(xlim=(0, 1.02))
     acts.invert_yaxis()
-    acts.legend(fontsize=7, loc="lower right")
+    acts.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.45, -0.12), ncols=2)
     acts.set_title(f"action probabilities; attention\non the message: {attention:.0f}", fontsize=9)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

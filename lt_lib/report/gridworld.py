@@ -8,11 +8,13 @@ from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from lt_lib.comm.messages import CONDITIONS
 from lt_lib.envs.gridworld import CELL, FREE, GOAL, HAZARD, RADIUS, UNKNOWN, WALL, Grid
 from lt_lib.envs.layout import SIDES
+from lt_lib.report.claims import Claim
 from lt_lib.report.pixels import SOLVED, final_shares
 from lt_lib.report.scene import NAVIGATOR, SCOUT
 from lt_lib.report.style import ROLES, chance_line
@@ -26,6 +28,7 @@ COLOURS = {
     GOAL: ("goal", "#4bab5b"),
 }
 CELLS = ListedColormap([colour for _, colour in COLOURS.values()])
+UNTOLD = ("floor", "position", "trajectory")  # contents that cannot say where the slab is
 GATES = {
     "hazard": "hazard-visible probe, unseen cells",
     "majority": "majority baseline",
@@ -80,6 +83,8 @@ def who_sees_what(grid: Grid) -> Figure:
         patch(axes, grid.patches[cell, slab], colour, f"{name}\nslab {SIDES[slab]}")
     keys = [Patch(fc=colour, ec="0.5", label=name) for name, colour in COLOURS.values()]
     keys.append(Patch(fc="white", ec="#b8860b", hatch="///", label="the placements look different from here"))
+    keys.append(Line2D([], [], color="r", marker="x", ls="", label="choice cell"))
+    keys.append(Line2D([], [], color=SCOUT, marker="s", ls="", label="scout's posts"))
     lower.legend(handles=keys, loc="outside lower center", ncols=len(keys), fontsize=8.5)
     return figure
 
@@ -99,6 +104,14 @@ def latent_map(reports: Mapping[str, Result]) -> Figure:
 def solved(policies: Sequence[Result]) -> int:
     """How many seeds succeed in at least 0.9 of their last 500 training episodes."""
     return int((final_shares(policies, "success") >= SOLVED).sum())
+
+
+def papers(claims: Mapping[str, Claim]) -> dict[str, str]:
+    """How many seeds of each content the paper solved, in words."""
+    untold = claims["grid.kinematic"]
+    counts = {name: claims[f"grid.{name}"] for name in ("latent", "predicted", "raw")}
+    told = {name: f"{claim.paper} of {claim.n}" for name, claim in counts.items()}
+    return told | dict.fromkeys(UNTOLD, f"{untold.paper} of {untold.n // len(UNTOLD)}")
 
 
 def seed_dots(groups: Mapping[str, Sequence[Result]], colours: Mapping[str, str], paper: Mapping[str, str]) -> Figure:
