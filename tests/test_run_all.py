@@ -288,7 +288,7 @@ def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(proje
     assert "ended without writing outputs/smoke/results/03_gridworld.json" in lines["03_gridworld"]
     assert "skipped" in lines["04_pixels"]
     assert lines["04_pixels"].endswith("needs 02_encoder")
-    assert lines["07_corruption"].endswith("needs 04_pixels")
+    assert lines["07_corruption"].endswith("needs 03_gridworld")
     assert "ok" in lines["08_hardware_decode"]
     assert losses(project, "08_hardware_decode") == [1]
 
