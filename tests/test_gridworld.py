@@ -452,6 +452,7 @@ def test_who_falls_who_peeks_and_who_must_not_change_are_told_apart():
     moved = played({"intact": 0.5, "wire_zeroed": 0.8})
     judged = grid_corruption.judge(policies, {"latent": [reads, reads], "raw": [peeks], "floor": [moved]})
     assert judged["grid.invariant"]["value"] == "not all" and not judged["grid.invariant"]["holds"]
+    assert "grid.corrupt" not in grid_corruption.judge({"floor": [trained(0.5)]}, {"floor": [deaf]})
 
 
 def test_an_unknown_setting_inside_a_section_is_named_with_its_neighbours():

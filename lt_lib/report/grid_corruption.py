@@ -70,7 +70,10 @@ def table(policies: Policies, played: Played) -> pd.DataFrame:
 
 
 def judge(policies: Policies, played: Played) -> dict[str, dict[str, Any]]:
-    """The gridworld's three findings: policies that fall, policies that peek, and those that must not change."""
+    """The gridworld's findings: policies that fall, policies that peek, and those that must not change.
+
+    Where no policy solved the task, as at smoke size, there is nothing to say of the first.
+    """
     pairs = [
         (name, row, share >= SOLVED)
         for name, rows in played.items()
@@ -85,13 +88,13 @@ def judge(policies: Policies, played: Played) -> dict[str, dict[str, Any]]:
     p = min((_changed(row, wire) for row in unsolved for wire in DESTROYED), default=1.0)
     cells = max(1, len(unsolved) * len(DESTROYED))
     unchanged = p > LEVEL / cells
-    return {
-        "grid.corrupt": {
-            "value": f"{len(fallen)} of {len(counted)}",
-            "test": f"success at most {RETURNED} under every destroyed wire",
-            "holds": bool(counted) and len(fallen) >= 0.75 * len(counted),
-            "note": f"the best of them under any destroyed wire has {worst:.2f}",
-        },
+    corrupt = {
+        "value": f"{len(fallen)} of {len(counted)}",
+        "test": f"success at most {RETURNED} under every destroyed wire",
+        "holds": len(fallen) >= 0.75 * len(counted),
+        "note": f"the best of them under any destroyed wire has {worst:.2f}",
+    }
+    return ({"grid.corrupt": corrupt} if counted else {}) | {
         "grid.peek": {
             "value": len(peeking),
             "test": "keeps its success without the message, and enters both corridors",
