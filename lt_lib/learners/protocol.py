@@ -14,6 +14,7 @@ from lt_lib.comm.messages import CONDITIONS
 from lt_lib.envs.layout import load_layout
 from lt_lib.learners.episodes import ROUTES, roll_bank
 from lt_lib.learners.executor import train_executor
+from lt_lib.learners.redraw import REDRAWS, train_redrawn_head
 from lt_lib.learners.route import evaluate_head, train_head
 from lt_lib.params import (
     ROOT,
@@ -25,6 +26,7 @@ from lt_lib.params import (
     GateConfig,
     Gates,
     HeadConfig,
+    RedrawConfig,
     Training,
     UserError,
 )  # fmt: skip
@@ -51,6 +53,7 @@ class Protocol:
     executor: ExecutorConfig = ExecutorConfig()
     bank: BankConfig = BankConfig()
     head: HeadConfig = HeadConfig()
+    redraw: RedrawConfig = RedrawConfig()
     shards: int = 8
     weights: Path | None = None
 
@@ -134,6 +137,23 @@ class Protocol:
         results = dict(zip(runs, self.store.fetch(list(runs.values()), "route heads"), strict=True))
         return {name: [results[name, seed] for seed in range(count)] for name, count in seeds.items()}
 
+    def redrawn_heads(
+        self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result, credit: str = "episode"
+    ) -> dict[str, list[Result]]:
+        """The lower block of Table III: so many seeds of each row of REDRAWS, trained live on the bank's scenes."""
+        inputs = {
+            "scenes": {name: bank[name] for name in ("spawn", "scout")},
+            "encoder": encoder,
+            "executor": executor,
+        }
+        runs = {
+            (name, seed): Run(train_redrawn_head, self._redrawn(name, credit), seed, inputs)
+            for name, count in seeds.items()
+            for seed in range(count)
+        }
+        results = dict(zip(runs, self.store.fetch(list(runs.values()), "redrawn heads"), strict=True))
+        return {name: [results[name, seed] for seed in range(count)] for name, count in seeds.items()}
+
     def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
         """A frozen trained head under every wire condition of Table IV, greedily."""
         inputs = {"head": _weights_only(head), "bank": bank, "encoder": encoder}
@@ -150,6 +170,12 @@ class Protocol:
             raise UserError(f"unknown message condition '{name}'; known: {', '.join(CONDITIONS)}")
         condition = CONDITIONS[name]
         return self.head.model_copy(update={"content": condition.content, "wire": condition.wire})
+
+    def _redrawn(self, name: str, credit: str) -> RedrawConfig:
+        if name not in REDRAWS:
+            raise UserError(f"unknown row '{name}' of the redrawn route; known: {', '.join(REDRAWS)}")
+        row = REDRAWS[name]
+        return self.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": credit})
 
 
 def _weights_only(head: Result) -> Result:

@@ -25,6 +25,23 @@ from lt_lib.learners.executor import FrozenExecutor
 from lt_lib.params import PpoConfig, RedrawConfig
 from lt_lib.perception.encoder import FrozenEncoder, best_device
 
+
+
+class Redraw(NamedTuple):
+    """A row of the lower block of Table III: what is sent, and how often the route is drawn."""
+
+    content: str
+    every: int  # control steps, the paper's k; 0: once
+    role: str
+    words: str
+
+
+REDRAWS = {
+    "k0": Redraw("latent", 0, "ours", "latent $z_t$, one draw ($k=0$)"),
+    "k30": Redraw("latent", 30, "ours", "latent $z_t$, every 30 steps"),
+    "k1": Redraw("latent", 1, "ours", "latent $z_t$, every step ($k=1$)"),
+    "oracle_k1": Redraw("oracle", 1, "diagnostic", "oracle, every step ($k=1$)"),
+}
 BLOCK = 16  # frames are encoded in multiples of this, so that a row's arithmetic does not depend on its neighbours'
 UNSEEN = 255  # no palette index
 
@@ -205,8 +222,8 @@ def generalised(decisions: Decisions, outcome: Outcomes, values: Float[Tensor, "
     time = np.arange(len(episode)) - np.searchsorted(episode, episode)
     reward, value = torch.zeros(2, time.max() + 1, len(outcome.success))
     reward[time, episode], value[time, episode] = torch.from_numpy(decisions.rewards).float(), values
-    ended = torch.ones_like(reward, dtype=torch.bool)
-    ended[time[1:] - 1, episode[1:]] = time[1:] == 0
+    ended, again = torch.ones_like(reward, dtype=torch.bool), time > 0
+    ended[time[again] - 1, episode[again]] = False
     following = torch.cat([value[1:], torch.zeros_like(value[:1])])
     gain = ppo.advantages(reward, value, following, ended, ended, config.gamma, config.lam)[time, episode]
     return gain, gain + values
