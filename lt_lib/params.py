@@ -355,7 +355,6 @@ SECTIONS: dict[str, Any] = {
     "grid_gates": PatchGates,
     "grid": GridConfig,
     "seeds": dict[str, PositiveInt],
-    "redraw_seeds": dict[str, PositiveInt],
     "shards": PositiveInt,
     "more_seeds": PositiveInt,
     "latent_heads": PositiveInt,

@@ -33,15 +33,9 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
                 load_frozen(root / parameters["weights"], kind, layout)
     if "seeds" in parameters:
         from lt_lib.comm.messages import CONDITIONS
-
-        _require_known("seeds", "message condition", parameters["seeds"], CONDITIONS)
-    if "redraw_seeds" in parameters:
         from lt_lib.learners.redraw import REDRAWS
 
-        _require_known("redraw_seeds", "row of the redrawn route", parameters["redraw_seeds"], REDRAWS)
-
-
-def _require_known(name: str, what: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    unknown = sorted(set(given) - set(known))
-    if unknown:
-        raise UserError(f"{name}: unknown {what} '{unknown[0]}'; there are {', '.join(known)}")
+        known = (*CONDITIONS, *REDRAWS)
+        unknown = sorted(set(parameters["seeds"]) - set(known))
+        if unknown:
+            raise UserError(f"seeds: unknown message condition '{unknown[0]}'; there are {', '.join(known)}")

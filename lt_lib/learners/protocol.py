@@ -138,7 +138,7 @@ class Protocol:
         return {name: [results[name, seed] for seed in range(count)] for name, count in seeds.items()}
 
     def redrawn_heads(
-        self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result, credit: str = "episode"
+        self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result
     ) -> dict[str, list[Result]]:
         """The lower block of Table III: so many seeds of each row of REDRAWS, trained live on the bank's scenes."""
         inputs = {
@@ -147,7 +147,7 @@ class Protocol:
             "executor": executor,
         }
         runs = {
-            (name, seed): Run(train_redrawn_head, self._redrawn(name, credit), seed, inputs)
+            (name, seed): Run(train_redrawn_head, self._redrawn(name), seed, inputs)
             for name, count in seeds.items()
             for seed in range(count)
         }
@@ -171,11 +171,11 @@ class Protocol:
         condition = CONDITIONS[name]
         return self.head.model_copy(update={"content": condition.content, "wire": condition.wire})
 
-    def _redrawn(self, name: str, credit: str) -> RedrawConfig:
+    def _redrawn(self, name: str) -> RedrawConfig:
         if name not in REDRAWS:
             raise UserError(f"unknown row '{name}' of the redrawn route; known: {', '.join(REDRAWS)}")
         row = REDRAWS[name]
-        return self.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": credit})
+        return self.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
 
 
 def _weights_only(head: Result) -> Result:

@@ -26,21 +26,23 @@ from lt_lib.params import PpoConfig, RedrawConfig
 from lt_lib.perception.encoder import FrozenEncoder, best_device
 
 
-
 class Redraw(NamedTuple):
-    """A row of the lower block of Table III: what is sent, and how often the route is drawn."""
+    """How often the route is drawn, and from what: the lower block of Table III, and another reading of it."""
 
     content: str
     every: int  # control steps, the paper's k; 0: once
+    credit: str  # a name in CREDITS
     role: str
     words: str
 
 
 REDRAWS = {
-    "k0": Redraw("latent", 0, "ours", "latent $z_t$, one draw ($k=0$)"),
-    "k30": Redraw("latent", 30, "ours", "latent $z_t$, every 30 steps"),
-    "k1": Redraw("latent", 1, "ours", "latent $z_t$, every step ($k=1$)"),
-    "oracle_k1": Redraw("oracle", 1, "diagnostic", "oracle, every step ($k=1$)"),
+    "k0": Redraw("latent", 0, "episode", "ours", "latent $z_t$, one draw ($k=0$)"),
+    "k30": Redraw("latent", 30, "episode", "ours", "latent $z_t$, every 30 steps"),
+    "k1": Redraw("latent", 1, "episode", "ours", "latent $z_t$, every step ($k=1$)"),
+    "oracle_k1": Redraw("oracle", 1, "episode", "diagnostic", "oracle, every step ($k=1$)"),
+    "k30_gae": Redraw("latent", 30, "gae", "ours", "every 30 steps, discounted credit"),
+    "k1_gae": Redraw("latent", 1, "gae", "ours", "every step, discounted credit"),
 }
 BLOCK = 16  # frames are encoded in multiples of this, so that a row's arithmetic does not depend on its neighbours'
 UNSEEN = 255  # no palette index
