@@ -16,6 +16,9 @@ from lt_lib.report.pixels import final_shares
 from lt_lib.report.style import ROLES, chance_line
 from lt_lib.runs import Result
 
+CREDIT_COLOURS = (ROLES["ours"], ROLES["upper bound"])
+CREDIT_WORDS = ("whole episode return (ours)", "discounted advantages (GAE)")
+
 
 def judge(name: str, shares: np.ndarray, once: np.ndarray, floor: np.ndarray) -> dict[str, Any]:
     """One cell of the lower block as a finding.
@@ -48,19 +51,15 @@ def fall_test(groups: Sequence[ArrayLike]) -> dict[str, Any]:
     }
 
 
-def agreement(live: Sequence[Result], bank: Sequence[Result]) -> pd.DataFrame:
-    """The live rows of one draw against the bank's of the same seeds: in how many training episodes they agree."""
-    rows = [
-        {
-            "episodes": len(a["success"]),
-            **{name: (a[name] == b[name]).mean() for name in ("optimal", "success", "length")},
-            "largest difference of a weight": max(
-                np.abs(a[name] - b[name]).max() for name in a if name.startswith("head.")
-            ),
-        }
-        for a, b in zip(live, bank, strict=True)
-    ]
-    return pd.DataFrame(rows).rename_axis("seed")
+def agreement(live: Mapping[str, Sequence[Result]], bank: Sequence[Result]) -> pd.DataFrame:
+    """Live trainings with one draw an episode beside the bank's of the same seeds: the share of episodes that agree."""
+    rows = {
+        (name, seed): {"episodes": len(mine["success"])}
+        | {key: np.mean(mine[key] == kept[key][: len(mine[key])]) for key in ("optimal", "success", "length")}
+        for name, results in live.items()
+        for seed, (mine, kept) in enumerate(zip(results, bank, strict=False))
+    }
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis(["agrees with the bank in", "seed"])
 
 
 def table(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> pd.DataFrame:
@@ -83,7 +82,7 @@ def _plain(name: str) -> str:
 
 
 def routes(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> Figure:
-    """Route optimality by redraw rate; a dot a seed, a bar the mean, a diamond and its whisker the paper's mean, s.d."""
+    """Route optimality by redraw rate; a dot a seed, a bar the mean, a diamond the paper's mean and s.d."""
     figure = Figure(figsize=(8.6, 4.6), layout="constrained")
     axes = figure.subplots()
     for x, (name, results) in enumerate(heads.items()):
@@ -114,6 +113,23 @@ def curves(heads: Mapping[str, Sequence[Result]], batch: int) -> Figure:
         lower.axhline(np.log(2), color="black", ls="--", lw=0.8)
         lower.set_xlabel("training episodes")
     _name_rows(panels[:, 0])
+    return figure
+
+
+def readings(heads: Mapping[str, Sequence[Result]], batch: int) -> Figure:
+    """Route optimality over training under either reading of a draw's credit, a panel a redraw rate, every seed."""
+    pairs = [(name, other) for name, other in ((name, f"{name}_gae") for name in heads) if other in heads]
+    figure = Figure(figsize=(5.4 * len(pairs) + 1, 4.2), layout="constrained")
+    for axes, pair in zip(figure.subplots(1, len(pairs), sharey=True, squeeze=False)[0], pairs, strict=True):
+        for name, colour, words in zip(pair, CREDIT_COLOURS, CREDIT_WORDS, strict=True):
+            for head in heads[name]:
+                shares = _by_batch(head["optimal"], batch)
+                axes.plot(np.arange(1, len(shares) + 1) * batch, shares, color=colour, lw=1.2, alpha=0.8)
+            axes.plot([], [], color=colour, label=words)
+        axes.set(title=REDRAWS[pair[0]].words, xlabel="training episodes", ylim=(0.3, 1.03))
+        chance_line(axes)
+        axes.legend(loc="lower right", fontsize=9)
+    figure.axes[0].set_ylabel("route optimality of a batch")
     return figure
 
 
