@@ -282,6 +282,23 @@ class EvaluationConfig(Training):
     episodes: PositiveInt = 256
 
 
+class RedrawConfig(Training):
+    """The route head trained live, its route drawn anew every so many control steps (lower block of Table III)."""
+
+    content: str = "latent"  # a name in comm.messages.CONTENTS
+    every: NonNegativeInt = 0  # control steps between draws, the paper's k; 0: one draw an episode
+    credit: str = "episode"  # a name in learners.redraw.CREDITS
+    held_out: Share = 0.125  # of the bank's draws, as for the heads that train on the bank
+    episodes: PositiveInt = 6_000
+    batch: PositiveInt = 256  # episodes
+    minibatch: PositiveInt = 64  # episodes' worth of draws
+    lr: PositiveFloat = 3e-3
+    ppo: PpoConfig = PpoConfig()
+    envs: PositiveInt = 64
+    commit_step: NonNegativeInt = 2
+    precision: Precision = "float32"
+
+
 class PatchEncoderConfig(EncoderConfig):
     """Stage 1 in the gridworld, which has about a hundred views where the pixels have any number."""
 
@@ -345,6 +362,7 @@ SECTIONS: dict[str, Any] = {
     "executor": ExecutorConfig,
     "bank": BankConfig,
     "head": HeadConfig,
+    "redraw": RedrawConfig,
     "gridworld": GridworldConfig,
     "peek_seeds": dict[str, PositiveInt],
     "ablation_seeds": PositiveInt,

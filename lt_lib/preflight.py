@@ -33,10 +33,12 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
                 load_frozen(root / parameters["weights"], kind, layout)
     if "seeds" in parameters:
         from lt_lib.comm.messages import CONDITIONS
+        from lt_lib.learners.redraw import REDRAWS
 
-        unknown = sorted(set(parameters["seeds"]) - set(CONDITIONS))
+        known = (*CONDITIONS, *REDRAWS)
+        unknown = sorted(set(parameters["seeds"]) - set(known))
         if unknown:
-            raise UserError(f"seeds: unknown message condition '{unknown[0]}'; there are {', '.join(CONDITIONS)}")
+            raise UserError(f"seeds: unknown message condition '{unknown[0]}'; there are {', '.join(known)}")
     if "gridworld" in parameters:
         _check_gridworld(parameters)
 

@@ -14,6 +14,7 @@ from lt_lib.comm.messages import CONDITIONS
 from lt_lib.envs.layout import load_layout
 from lt_lib.learners.episodes import ROUTES, roll_bank
 from lt_lib.learners.executor import train_executor
+from lt_lib.learners.redraw import REDRAWS, train_redrawn_head
 from lt_lib.learners.route import evaluate_head, train_head
 from lt_lib.params import (
     ROOT,
@@ -25,6 +26,7 @@ from lt_lib.params import (
     GateConfig,
     Gates,
     HeadConfig,
+    RedrawConfig,
     Training,
     UserError,
 )  # fmt: skip
@@ -51,6 +53,7 @@ class Protocol:
     executor: ExecutorConfig = ExecutorConfig()
     bank: BankConfig = BankConfig()
     head: HeadConfig = HeadConfig()
+    redraw: RedrawConfig = RedrawConfig()
     shards: int = 8
     weights: Path | None = None
 
@@ -125,14 +128,44 @@ class Protocol:
         return {name: np.concatenate([shard[name] for shard in shards]) for name in shards[0]}
 
     def trained_heads(self, seeds: Mapping[str, int], bank: Result, encoder: Result) -> dict[str, list[Result]]:
-        """Stage 2: so many seeds of each condition of Table I, all with the same settings."""
+        """Stage 2: so many seeds of each condition of Table I, all with the same settings.
+
+        Rows of REDRAWS among the names are left to `redrawn_heads`.
+        """
         runs = {
             (name, seed): Run(train_head, self._head(name), seed, {"bank": bank, "encoder": encoder})
             for name, count in seeds.items()
+            if name not in REDRAWS
             for seed in range(count)
         }
-        results = dict(zip(runs, self.store.fetch(list(runs.values()), "route heads"), strict=True))
-        return {name: [results[name, seed] for seed in range(count)] for name, count in seeds.items()}
+        return self._by_name(runs, "route heads")
+
+    def redrawn_heads(
+        self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result
+    ) -> dict[str, list[Result]]:
+        """So many seeds of each row of REDRAWS among the names, trained live on the bank's scenes."""
+        inputs = _live_inputs(bank, encoder, executor)
+        runs = {
+            (name, seed): Run(train_redrawn_head, self._redrawn(name), seed, inputs)
+            for name, count in seeds.items()
+            if name in REDRAWS
+            for seed in range(count)
+        }
+        return self._by_name(runs, "redrawn heads")
+
+    def live_reference(self, bank: Result, encoder: Result, executor: Result) -> Result:
+        """Two batches of live training with one draw an episode, in float32: the bank's, episode by episode."""
+        changes = {"precision": "float32", "episodes": 2 * self.redraw.batch}
+        config = self._redrawn("k0").model_copy(update=changes)
+        run = Run(train_redrawn_head, config, SEED, _live_inputs(bank, encoder, executor))
+        return self.store.fetch([run], "live reference")[0]
+
+    def _by_name(self, runs: Mapping[tuple[str, int], Run], what: str) -> dict[str, list[Result]]:
+        """The results of runs named (row, seed): a list of seeds a row."""
+        results: dict[str, list[Result]] = {}
+        for (name, _), result in zip(runs, self.store.fetch(list(runs.values()), what), strict=True):
+            results.setdefault(name, []).append(result)
+        return results
 
     def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
         """A frozen trained head under every wire condition of Table IV, greedily."""
@@ -150,6 +183,15 @@ class Protocol:
             raise UserError(f"unknown message condition '{name}'; known: {', '.join(CONDITIONS)}")
         condition = CONDITIONS[name]
         return self.head.model_copy(update={"content": condition.content, "wire": condition.wire})
+
+    def _redrawn(self, name: str) -> RedrawConfig:
+        row = REDRAWS[name]
+        return self.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
+
+
+def _live_inputs(bank: Result, encoder: Result, executor: Result) -> dict[str, Result]:
+    scenes = {name: bank[name] for name in ("spawn", "scout")}
+    return {"scenes": scenes, "encoder": encoder, "executor": executor}
 
 
 def _weights_only(head: Result) -> Result:

@@ -9,20 +9,13 @@ from lt_lib.envs import arena
 from lt_lib.envs.layout import Layout
 from lt_lib.learners.protocol import Protocol
 
-# claims of this notebook that belong to the section on velocity commands
-REDRAW = (
-    "px.k0.route", "px.k0.success", "px.k30.route", "px.k30.success", "px.k1.route", "px.k1.success",
-    "px.oracle_k1.route", "px.oracle_k1.success", "px.redraw_order",
-)  # fmt: skip
-
-
 LEAST_FOR_THE_RANK_TEST = 5  # seeds a side: p = 1/252 cannot be had with fewer
 
 
 def out_of_reach(seeds: Mapping[str, int]) -> tuple[str, ...]:
-    """Claims that notebook 4 leaves open: the redraw rows, and the rank test where a profile has too few seeds."""
+    """Claims that notebook 4 leaves open: the rank test where a profile has too few seeds for it."""
     few = min(seeds["latent"], seeds["floor"]) < LEAST_FOR_THE_RANK_TEST
-    return (*REDRAW, *(["px.rank_test"] if few else []))
+    return ("px.rank_test",) if few else ()
 
 
 def pixel_settings(protocol: Protocol, layout: Layout) -> dict[str, Any]:
