@@ -57,9 +57,9 @@ class Curve(Settings):
 
 
 class Curves(Settings):
-    """The curves that the study left, by name, and the name of the one that it is judged by."""
+    """The curves that the study left, by name, and the name of the one that answers unless another is asked for."""
 
-    judged: str
+    main: str
     curves: dict[str, Curve]
 
 
@@ -77,9 +77,9 @@ def load_curve(name: str = "", path: Path = ROOT / "outputs" / "full" / CURVES) 
         raise UserError(explain(error, path.name, Curves)) from None
     except (OSError, ValueError) as error:
         raise UserError(f"{path.name}: cannot be read: {error}") from None
-    if (name or kept.judged) not in kept.curves:
-        raise UserError(f"{path.name}: no curve {name or kept.judged!r}; there are {', '.join(kept.curves)}")
-    return kept.curves[name or kept.judged]
+    if (name or kept.main) not in kept.curves:
+        raise UserError(f"{path.name}: no curve {name or kept.main!r}; there are {', '.join(kept.curves)}")
+    return kept.curves[name or kept.main]
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,9 @@ def centre_interval(curve: Curve) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def keep_curves(curves: Mapping[str, Curve], judged: str, outputs: Path) -> None:
-    """Writes the curves where the predictor looks for them."""
-    write_atomically(outputs / CURVES, (Curves(judged=judged, curves=dict(curves)).model_dump_json() + "\n").encode())
+def keep_curves(curves: Mapping[str, Curve], main: str, outputs: Path) -> None:
+    """Writes the curves where the predictor looks for them, with the name of the one that it answers from."""
+    write_atomically(outputs / CURVES, (Curves(main=main, curves=dict(curves)).model_dump_json() + "\n").encode())
 
 
 def outcomes(success: Float[np.ndarray, " r"]) -> dict[str, int]:
@@ -137,7 +137,7 @@ def generality(arms: Mapping[str, Runs], updates: int, curve: Curve, ours: float
     left.text(ours + 0.15, 0.5, f"our scene\nz = {ours:.1f}", fontsize=9, va="center")
     left.set(xlabel=r"$z = d\sqrt{N}/\sigma$, known before training", ylabel="share of seeds solved", xlim=(0, largest))
     left.set_title(f"a. Solved: final success of at least {CEILING}", fontsize=11)
-    left.legend(fontsize=8.5, loc="center right")
+    figure.legend(fontsize=9, loc="outside upper left", ncols=7)
     _coverage(right, gaussian, updates)
     return figure
 
@@ -245,7 +245,7 @@ def answers_figure(answers: Mapping[str, Answer]) -> Figure:
             fontsize=9,
         )
     axes.set(xlabel=r"$z = d\sqrt{N}/\sigma$ of the task", ylabel="share of runs that solve it", ylim=(-0.04, 1.16))
-    axes.legend(fontsize=9, loc="center right")
+    axes.legend(fontsize=9, loc="upper right")
     return figure
 
 
