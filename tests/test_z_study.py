@@ -46,7 +46,7 @@ def test_score_function_gradient_is_the_closed_form_on_a_one_step_problem():
 
 
 def test_categorical_gradient_is_the_closed_form():
-    n, logit = 1_000_000, np.array([[-0.4, 0.7]])
+    n, logit = 1_000_000, np.array([[0.9, 2.0]])  # far from even, so that a wrong centre of the score shows
     stack = Stack(3, np.array([[0.9]]), np.array([[1.0]]), np.array([[0]]))
     drawn = Episodes.draw(ARMS["categorical"], stack, [np.random.default_rng(1)], (n,))
     entered, score = play(ARMS["categorical"], stack, logit, drawn)
@@ -54,6 +54,15 @@ def test_categorical_gradient_is_the_closed_form():
     found = gradient(drawn.message, score, rewards - rewards.mean(1, keepdims=True))
     expected = 0.5 * expit(logit) * (1 - expit(logit)) * np.array([[-1.0, 1.0]])
     np.testing.assert_allclose(found, expected, atol=4 / np.sqrt(n))
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_message_tells_the_safe_side_but_in_the_control(name):
+    stack = Stack(3, *(np.array([[value]]) for value in (0.5, 1.0, 0)))
+    drawn = Episodes.draw(ARMS[name], stack, [np.random.default_rng(4)], (10_000,))
+    agree = (drawn.message == drawn.safe).mean()
+    assert agree == pytest.approx(0.5, abs=0.02) if name == "no_signal" else agree == 1.0
+    assert drawn.safe.mean() == pytest.approx(0.5, abs=0.02)
 
 
 def literal_run(config: PointMassConfig, d: float, sigma: float, seed: int) -> np.ndarray:
