@@ -354,6 +354,34 @@ class GridworldConfig(Settings):
     seeds: dict[str, PositiveInt]  # how many of each content
 
 
+BLOCK = 25  # updates of the point-mass study between two looks at it
+Budget = Annotated[int, Field(gt=0, multiple_of=BLOCK)]
+
+
+class PointMassConfig(Settings):
+    """One stack of the point-mass study: every d with every sigma at one window length (Section Scalar predictor)."""
+
+    arm: Literal["gaussian", "no_signal", "categorical", "steps", "clamped"] = "gaussian"
+    window: PositiveInt = 30  # control steps N
+    distances: tuple[PositiveFloat, ...] = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.3)
+    sigmas: tuple[PositiveFloat, ...] = (0.55, 1.0)
+    seeds: PositiveInt = 5
+    optimiser: Literal["adam", "sgd"] = "adam"
+    baseline: Literal["batch", "message"] = "batch"  # mean reward of the batch, or of its episodes with this message
+    lr: PositiveFloat = 0.02
+    batch: Annotated[int, Field(ge=2)] = 128  # episodes an update
+    budgets: Annotated[tuple[Budget, ...], Field(min_length=1)] = (
+        1_000,
+    )  # updates after which success is measured, in order; the last one ends the training
+    evaluation: PositiveInt = 32_768  # episodes of a measurement
+
+    @model_validator(mode="after")
+    def _budgets_in_order(self) -> "PointMassConfig":
+        if list(self.budgets) != sorted(set(self.budgets)):
+            raise ValueError(f"budgets must increase, got {list(self.budgets)}")
+        return self
+
+
 # How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
 SECTIONS: dict[str, Any] = {
     "encoder": EncoderConfig,
@@ -366,6 +394,13 @@ SECTIONS: dict[str, Any] = {
     "gridworld": GridworldConfig,
     "peek_seeds": dict[str, PositiveInt],
     "ablation_seeds": PositiveInt,
+    "point_mass": PointMassConfig,
+    "windows": Annotated[list[PositiveInt], Field(min_length=2)],
+    "looks": Annotated[list[Budget], Field(min_length=1)],
+    "sgd_rates": Annotated[list[PositiveFloat], Field(min_length=2)],
+    "resamples": Annotated[int, Field(ge=2)],
+    "step_evaluation": PositiveInt,
+    "singles": PositiveInt,
     "seeds": dict[str, PositiveInt],
     "shards": PositiveInt,
     "more_seeds": PositiveInt,
