@@ -1,0 +1,121 @@
+"""Direct transfer to velocity control, and what exploration reaches (Sections From Grid Actions, Exploration coverage).
+
+What notebook 5 asks the run store for. Every navigator is trained with the same settings but for what its name says.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from lt_lib.envs.layout import SIDES
+from lt_lib.learners.coverage import roll_navigator
+from lt_lib.learners.navigator import train_navigator
+from lt_lib.params import Boost, Exploration, NavigatorConfig, PpoConfig, RolloutConfig
+from lt_lib.runs import Result, Run, RunStore
+
+SEED = 0
+# The paper's six configurations vary hazard penalty, discount, spawn curriculum and layout; what each differs in
+DIRECT: Mapping[str, dict[str, Any]] = MappingProxyType(
+    {
+        "base": {},
+        "no hazard penalty": {"hazard": 0.0},
+        "hazard penalty x 5": {"hazard": 5.0},
+        "discount 0.995": {"ppo": PpoConfig(gamma=0.995)},
+        "more spawn curriculum": {"spawn_share": 0.25},
+        "wide layout": {"layout": "wide"},
+    }
+)
+# Beside them: the bit itself, no message, and the choice or the missing coverage removed by hand
+OTHERS: Mapping[str, dict[str, Any]] = MappingProxyType(
+    {
+        "oracle": {"content": "oracle"},
+        "silent": {"content": "floor"},
+        "no choice": {"content": "floor", "blocked": "right"},
+        "shown both mouths": {"content": "oracle", "starts": "anywhere"},
+    }
+)
+# The paper's boost is still 3.6 times the policy's own noise at iteration 80: a straight line that would end at 1
+# after twice as many. Held, it tells suppression from decay, which one annealed run cannot
+BOOSTS = MappingProxyType(
+    {
+        "annealed": Boost(first=6.2, last=3.6, at=80),
+        "held": Boost(first=6.2, last=6.2, at=80),
+        "none": Boost(),
+    }
+)
+SAMPLED, GREEDY = Exploration(window=0), Exploration(window=0, own=0.0)
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """The navigators at one size, behind one frozen encoder."""
+
+    store: RunStore
+    encoder: Result
+    navigator: NavigatorConfig
+    rollout: RolloutConfig
+
+    def navigators(self, seeds: Mapping[str, int]) -> dict[str, list[Result]]:
+        """All navigators trained from scratch, by name; `seeds` says how many of each, one where it says nothing."""
+        runs = {
+            (name, seed): Run(train_navigator, self._config(name), seed, {"encoder": self.encoder})
+            for name in (*DIRECT, *OTHERS)
+            for seed in range(seeds.get(name, 1))
+        }
+        results = dict(zip(runs, self.store.fetch(list(runs.values()), "navigators"), strict=True))
+        return {name: [results[key] for key in runs if key[0] == name] for name, _ in runs}
+
+    def _config(self, name: str) -> NavigatorConfig:
+        changes = {"content": "latent"} | DIRECT[name] if name in DIRECT else OTHERS[name]
+        return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | changes))
+
+    def evaluated(self, navigators: Mapping[str, list[Result]]) -> dict[str, list[Result]]:
+        """Each navigator with the slab at random; two rows, as it explores and without noise."""
+        runs = {
+            (name, i): self._roll(self._rollout(name, rows=(SAMPLED, GREEDY)), navigator)
+            for name, results in navigators.items()
+            for i, navigator in enumerate(results)
+        }
+        results = dict(zip(runs, self.store.fetch(list(runs.values()), "evaluations"), strict=True))
+        return {name: [results[key] for key in runs if key[0] == name] for name in navigators}
+
+    def flipped(self, oracles: list[Result]) -> dict[tuple[str, bool], list[Result]]:
+        """The oracle-bit navigators without noise: by the blocked corridor, and whether they are told the truth."""
+        cases = [(side, true) for side in SIDES for true in (True, False)]
+        configs = [self._rollout("oracle", rows=(GREEDY,), blocked=side, truthful=true) for side, true in cases]
+        runs = [self._roll(config, navigator) for config in configs for navigator in oracles]
+        results = iter(self.store.fetch(runs, "flipped bits"))
+        return {case: [next(results) for _ in oracles] for case in cases}
+
+    def swept(
+        self, navigator: Result, blocked: str, groups: Mapping[str, tuple[Exploration, ...]]
+    ) -> dict[str, Result]:
+        """One frozen navigator without a message under imposed noise, the slab always in `blocked`."""
+        runs = [self._roll(self._rollout("silent", rows=rows, blocked=blocked), navigator) for rows in groups.values()]
+        return dict(zip(groups, self.store.fetch(runs, "coverage sweep"), strict=True))
+
+    def boosted(self, navigator: Result) -> dict[str, Result]:
+        """Training goes on from a silent navigator, now with the oracle's bit, by what becomes of the boost."""
+        runs = [
+            Run(
+                train_navigator,
+                self._config("oracle").model_copy(update={"boost": boost}),
+                SEED,
+                {"encoder": self.encoder, "start": _weights_only(navigator)},
+            )
+            for boost in BOOSTS.values()
+        ]
+        return dict(zip(BOOSTS, self.store.fetch(runs, "boosted trainings"), strict=True))
+
+    def _rollout(self, name: str, **changes: Any) -> RolloutConfig:
+        trained = self._config(name)
+        shared = {key: getattr(trained, key) for key in ("layout", "device", "content", "precision")}
+        return self.rollout.model_copy(update=shared | changes)
+
+    def _roll(self, config: RolloutConfig, navigator: Result) -> Run:
+        return Run(roll_navigator, config, SEED, {"encoder": self.encoder, "navigator": _weights_only(navigator)})
+
+
+def _weights_only(navigator: Result) -> Result:
+    return {name: value for name, value in navigator.items() if name.startswith("navigator.")}

@@ -1,0 +1,101 @@
+"""Figures and judgements of the direct transfer to velocity control (Section From Grid Actions)."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from lt_lib.envs.layout import SIDES
+from lt_lib.learners.navigator import LATERAL
+from lt_lib.learners.transfer import DIRECT
+from lt_lib.report import stats
+from lt_lib.report.style import ROLES, chance_line
+from lt_lib.runs import Result
+
+COMMITTED = 0.95  # least share of one corridor, under either placement, of a navigator that has committed to it
+OTHERS = {"oracle": "diagnostic", "silent": "lower bound", "no choice": "upper bound", "shown both mouths": "kinematic"}
+COLOURS = {name: ROLES["ours"] for name in DIRECT} | {name: ROLES[role] for name, role in OTHERS.items()}
+
+
+def null(evaluated: Mapping[str, Sequence[Result]]) -> Figure:
+    """Route optimality of every navigator as it explores, and which corridor it enters under either placement."""
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    bars = [(name, result) for name, results in evaluated.items() for result in results]
+    for x, (name, result) in enumerate(bars):
+        chosen, colour = optimal(result), COLOURS[name]
+        low, high = stats.wilson(chosen.sum(), len(chosen))
+        mean = chosen.mean()
+        upper.errorbar(x, mean, [[mean - low], [high - mean]], fmt="o", color=colour, capsize=4)
+        for slab, shift in ((0, -0.17), (1, 0.17)):
+            first = result["first"][0][result["slab"][0] == slab]
+            shares = [(first == side).mean() if len(first) else 0.0 for side in (0, 1)]
+            lower.bar(x + shift, shares[0], 0.3, color=ROLES["ours"])
+            lower.bar(x + shift, shares[1], 0.3, bottom=shares[0], color=ROLES["upper bound"])
+    chance_line(upper)
+    upper.set(ylim=(-0.03, 1.05), ylabel="route optimality")
+    lower.set(ylim=(0, 1.05), ylabel="first corridor entered\n(blue left, orange right)")
+    lower.set_xticks(range(len(bars)), [name.replace(" ", "\n") for name, _ in bars], fontsize=8)
+    upper.set_title(
+        "One dot a training, Wilson's 95% interval. Lower pairs of bars: slab left, slab right", fontsize=11
+    )
+    return figure
+
+
+def optimal(result: Result, row: int = 0) -> np.ndarray:
+    """Per episode, whether the first corridor entered was the slab-free one; entering none is not."""
+    return (result["first"][row] >= 0) & (result["first"][row] != result["slab"][row])
+
+
+def commitment(result: Result, row: int = 0) -> tuple[int, float]:
+    """The incumbent: the corridor entered first in most episodes; and its least share under either placement."""
+    first, slab = result["first"][row], result["slab"][row]
+    incumbent = int((first == 1).sum() > (first == 0).sum())
+    return incumbent, float(min((first[slab == s] == incumbent).mean() for s in np.unique(slab)))
+
+
+def learning(trained: Mapping[str, Sequence[Result]], block: int) -> Figure:
+    """Training episodes from the spawn: share entering the left corridor first, route optimality and arrivals."""
+    figure = Figure(figsize=(15, 3.6), layout="constrained")
+    panels = figure.subplots(1, len(trained), sharey=True)
+    for axes, (name, results) in zip(panels, trained.items(), strict=True):
+        for result in results:
+            update, slab, first, arrived = result["episodes"].T
+            blocks = np.arange(-(-len(result["boost"]) // block))
+            for values, colour, style in (
+                (first == 0, "0.6", "--"),
+                ((first >= 0) & (first != slab), COLOURS[name], "-"),
+                (arrived, "black", ":"),
+            ):
+                means = [
+                    values[update // block == b].mean() if (update // block == b).any() else np.nan for b in blocks
+                ]
+                axes.plot((blocks + 0.5) * block, means, color=colour, ls=style, lw=1.4)
+        chance_line(axes)
+        axes.set_title(name.replace(" ", "\n", 1), fontsize=9)
+        axes.set_xlabel("iteration", fontsize=8)
+    panels[0].set(ylim=(-0.03, 1.05), ylabel="share of episodes")
+    figure.suptitle("Solid: route optimality. Dashed: entered the left corridor first. Dotted: arrived", fontsize=10)
+    return figure
+
+
+def table(evaluated: Mapping[str, Sequence[Result]], trained: Mapping[str, Sequence[Result]]) -> pd.DataFrame:
+    """A line a training: route optimality and success as it explores and without noise, commitment, lateral noise."""
+    lines = []
+    for name, results in evaluated.items():
+        for result, navigator in zip(results, trained[name], strict=True):
+            incumbent, share = commitment(result)
+            free = result["slab"][1] != incumbent
+            lines.append(
+                {
+                    "training": name,
+                    "route optimality": optimal(result).mean(),
+                    "success": result["success"][0].mean(),
+                    "incumbent": SIDES[incumbent],
+                    "its least share": share,
+                    "success, incumbent free, no noise": result["success"][1][free].mean() if free.any() else np.nan,
+                    "lateral sigma": navigator["sigma"][-1, LATERAL],
+                }
+            )
+    return pd.DataFrame(lines).set_index("training").round(3)
