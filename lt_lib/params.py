@@ -181,6 +181,10 @@ def layout_path(name: str) -> Path:
 Device = Literal["auto", "cpu", "cuda"]
 Share = Annotated[float, Field(ge=0, le=1)]
 Precision = Literal["float32", "bfloat16"]
+# The six direct transfers to velocity control, by what each varies (learners/transfer.py)
+Configuration = Literal[
+    "base", "no hazard penalty", "hazard penalty x 5", "discount 0.995", "more spawn curriculum", "wide layout",
+]  # fmt: skip
 
 
 class Training(Settings):
@@ -341,6 +345,10 @@ SECTIONS: dict[str, Any] = {
     "navigator": NavigatorConfig,
     "rollout": RolloutConfig,
     "oracle_seeds": PositiveInt,
+    "configurations": Annotated[list[Configuration], Field(min_length=1)],
+    "sigmas": Annotated[list[PositiveFloat], Field(min_length=1)],
+    "taus": Annotated[list[NonNegativeFloat], Field(min_length=1)],
+    "draws": PositiveInt,
     "seeds": dict[str, PositiveInt],
     "shards": PositiveInt,
     "more_seeds": PositiveInt,

@@ -3,7 +3,7 @@
 What notebook 5 asks the run store for. Every navigator is trained with the same settings but for what its name says.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 from lt_lib.envs.layout import SIDES
 from lt_lib.learners.coverage import roll_navigator
 from lt_lib.learners.navigator import train_navigator
+from lt_lib.learners.protocol import Protocol
 from lt_lib.params import Boost, Exploration, NavigatorConfig, PpoConfig, RolloutConfig
 from lt_lib.runs import Result, Run, RunStore
 
@@ -56,12 +57,19 @@ class Transfer:
     navigator: NavigatorConfig
     rollout: RolloutConfig
 
-    def navigators(self, seeds: Mapping[str, int]) -> dict[str, list[Result]]:
-        """All navigators trained from scratch, by name; `seeds` says how many of each, one where it says nothing."""
+    @classmethod
+    def of(cls, protocol: Protocol, navigator: Mapping[str, Any], rollout: Mapping[str, Any]) -> "Transfer":
+        """From a notebook's parameters; the dicts are those of params.SECTIONS. Raises GateError."""
+        shared = {"layout": protocol.encoder.layout, "device": protocol.encoder.device}
+        configs = NavigatorConfig(**shared, **navigator), RolloutConfig(**shared, **rollout)
+        return cls(protocol.store, protocol.frozen_encoder(), *configs)
+
+    def navigators(self, configurations: Sequence[str], oracle_seeds: int) -> dict[str, list[Result]]:
+        """All navigators trained from scratch, by name: one of each, `oracle_seeds` of those that are told the bit."""
         runs = {
             (name, seed): Run(train_navigator, self._config(name), seed, {"encoder": self.encoder})
-            for name in (*DIRECT, *OTHERS)
-            for seed in range(seeds.get(name, 1))
+            for name in (*configurations, *OTHERS)
+            for seed in range(oracle_seeds if name == "oracle" else 1)
         }
         results = dict(zip(runs, self.store.fetch(list(runs.values()), "navigators"), strict=True))
         return {name: [results[key] for key in runs if key[0] == name] for name, _ in runs}
@@ -88,12 +96,10 @@ class Transfer:
         results = iter(self.store.fetch(runs, "flipped bits"))
         return {case: [next(results) for _ in oracles] for case in cases}
 
-    def swept(
-        self, navigator: Result, blocked: str, groups: Mapping[str, tuple[Exploration, ...]]
-    ) -> dict[str, Result]:
-        """One frozen navigator without a message under imposed noise, the slab always in `blocked`."""
-        runs = [self._roll(self._rollout("silent", rows=rows, blocked=blocked), navigator) for rows in groups.values()]
-        return dict(zip(groups, self.store.fetch(runs, "coverage sweep"), strict=True))
+    def swept(self, navigator: Result, blocked: str, groups: Sequence[tuple[Exploration, ...]]) -> list[Result]:
+        """A frozen navigator without a message under groups of rows of noise, the slab always in `blocked`."""
+        runs = [self._roll(self._rollout("silent", rows=rows, blocked=blocked), navigator) for rows in groups]
+        return self.store.fetch(runs, "coverage sweep")
 
     def boosted(self, navigator: Result) -> dict[str, Result]:
         """Training goes on from a silent navigator, now with the oracle's bit, by what becomes of the boost."""

@@ -8,14 +8,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
-from scipy.stats import binomtest, rankdata, spearmanr
+from scipy.stats import binomtest, fisher_exact, rankdata, spearmanr
 
 from lt_lib.envs.layout import SIDES, Layout
 from lt_lib.params import Exploration
 from lt_lib.report import scene, stats
 from lt_lib.report.claims import Claim
-from lt_lib.report.style import ROLES, chance_line
+from lt_lib.report.style import ROLES
 from lt_lib.runs import Result
 
 HORIZON, WINDOW = 600, 40  # control steps: an episode, and the window of the paper's boost
@@ -87,14 +86,17 @@ def opposition(found: Sequence[Row]) -> tuple[float, float]:
     return float(a @ b / np.sqrt((a @ a) * (b @ b))), float(np.mean(orders <= a @ b + 1e-9))
 
 
-def window_ratio(outside: int, inside: int, boost: ArrayLike = 1.0) -> np.ndarray:
+def window_ratio(outside: int, inside: int, boost: float = 1.0) -> float:
     """Aggregate score-function gradient outside the window over that inside: (N_out / N_in) (sigma_in / sigma_out).
 
-    boost  sigma_in / sigma_out
+    outside, inside  control steps
+    boost            sigma_in / sigma_out, of the boosted window over the policy's own noise
+
+    Raises ValueError for steps or a boost that cannot be.
     """
-    if inside <= 0 or outside < 0 or np.min(boost) <= 0:
+    if inside <= 0 or outside < 0 or boost <= 0:
         raise ValueError(f"window_ratio: expected steps and a positive boost, got {outside}, {inside}, {boost}")
-    return outside / inside * np.asarray(boost, float)
+    return outside / inside * boost
 
 
 def table(found: Mapping[str, Row], settings: Mapping[str, Exploration], paper: Mapping[str, Claim]) -> pd.DataFrame:
@@ -190,11 +192,8 @@ def boosts(trained: Mapping[str, Result], incumbent: int, block: int, paper: Map
         error = [mean - low, high - mean]
         upper.errorbar(edges[1:] - block / 2, mean, error, fmt="o-", color=ROLES[role], capsize=3, label=name)
         lower.plot(np.arange(1, len(result["boost"]) + 1), result["boost"], color=ROLES[role])
-    for (first, last), claim in (
-        (EARLY[:: len(EARLY) - 1], "cov.boost_early"),
-        (LATE[:: len(LATE) - 1], "cov.boost_late"),
-    ):
-        upper.fill_between([first, last], *paper[claim].paper, color="0.8", zorder=0)
+    for edges, claim in ((EARLY, "cov.boost_early"), (LATE, "cov.boost_late")):
+        upper.fill_between([edges[0], edges[-1]], *paper[claim].paper, color="0.8", zorder=0)
     upper.fill_between([], [], [], color="0.8", label="paper's range")
     upper.set(ylabel="success, slab in the\nincumbent corridor", ylim=(-0.03, 1.03))
     upper.legend(fontsize=8)
@@ -203,7 +202,7 @@ def boosts(trained: Mapping[str, Result], incumbent: int, block: int, paper: Map
     return figure
 
 
-def alternative_success(result: Result, incumbent: int, edges: ArrayLike) -> np.ndarray:
+def alternative_success(result: Result, incumbent: int, edges: Sequence[int] | np.ndarray) -> np.ndarray:
     """(successes, episodes) between iteration edges: training episodes from the spawn with the incumbent blocked."""
     update, slab, _, arrived = result["episodes"].T
     kept = slab == incumbent
@@ -211,11 +210,32 @@ def alternative_success(result: Result, incumbent: int, edges: ArrayLike) -> np.
     return np.column_stack(counts).astype(np.int64)
 
 
-def boosted_range(result: Result, incumbent: int, edges: ArrayLike) -> tuple[dict[str, Any], np.ndarray]:
-    """The least and the largest success between the edges as a finding's value, and their counts.
+class Block(NamedTuple):
+    """Success with the incumbent blocked, between iteration edges: a finding of its range, and the counts."""
 
-    Blocks without an episode are left out; (0, 0) if there is none.
-    """
+    finding: dict[str, Any]
+    succeeded: int
+    n: int
+
+    @property
+    def share(self) -> float:
+        return self.succeeded / self.n if self.n else 0.0
+
+
+def boosted_range(result: Result, incumbent: int, edges: Sequence[int] | np.ndarray) -> Block:
+    """The least and the largest success between the edges; parts without an episode are left out, (0, 0) if all are."""
     counts = alternative_success(result, incumbent, edges)
     shares = [s / n for s, n in counts if n] or [0.0]
-    return {"value": (min(shares), max(shares)), "n": max(1, int(counts[:, 1].sum()))}, counts.sum(axis=0)
+    succeeded, n = map(int, counts.sum(axis=0))
+    return Block({"value": (min(shares), max(shares)), "n": max(1, n)}, succeeded, n)
+
+
+def decay(early: Block, late: Block) -> float:
+    """One-sided Fisher exact p that the alternative corridor succeeds more rarely late than early."""
+    counts = [[block.succeeded, block.n - block.succeeded] for block in (early, late)]
+    return float(fisher_exact(counts, alternative="greater").pvalue)
+
+
+def finer(sigmas: Sequence[float], taus: Sequence[float]) -> dict[float, tuple[Exploration, ...]]:
+    """The grid of the finer sweep, by sigma."""
+    return {sigma: tuple(Exploration(sigma=sigma, tau=tau) for tau in taus) for sigma in sigmas}

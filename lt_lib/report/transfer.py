@@ -1,9 +1,11 @@
 """Figures and judgements of the direct transfer to velocity control (Section From Grid Actions)."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
 from lt_lib.envs.layout import SIDES
@@ -37,9 +39,7 @@ def null(evaluated: Mapping[str, Sequence[Result]]) -> Figure:
     upper.set(ylim=(-0.03, 1.05), ylabel="route optimality")
     lower.set(ylim=(0, 1.05), ylabel="first corridor entered\n(blue left, orange right)")
     lower.set_xticks(range(len(bars)), [name.replace(" ", "\n") for name, _ in bars], fontsize=8)
-    upper.set_title(
-        "One dot a training, Wilson's 95% interval. Lower pairs of bars: slab left, slab right", fontsize=11
-    )
+    upper.set_title("A dot a training, Wilson's 95% interval. Lower pairs of bars: slab left, slab right", fontsize=11)
     return figure
 
 
@@ -68,9 +68,7 @@ def learning(trained: Mapping[str, Sequence[Result]], block: int) -> Figure:
                 ((first >= 0) & (first != slab), COLOURS[name], "-"),
                 (arrived, "black", ":"),
             ):
-                means = [
-                    values[update // block == b].mean() if (update // block == b).any() else np.nan for b in blocks
-                ]
+                means = [values[update // block == b].mean() if b in update // block else np.nan for b in blocks]
                 axes.plot((blocks + 0.5) * block, means, color=colour, ls=style, lw=1.4)
         chance_line(axes)
         axes.set_title(name.replace(" ", "\n", 1), fontsize=9)
@@ -99,3 +97,67 @@ def table(evaluated: Mapping[str, Sequence[Result]], trained: Mapping[str, Seque
                 }
             )
     return pd.DataFrame(lines).set_index("training").round(3)
+
+
+def arrivals(result: Result) -> tuple[int, int]:
+    """(successes, episodes) where the slab leaves the incumbent corridor free, actions sampled."""
+    free = result["slab"][0] != commitment(result)[0]
+    return int(result["success"][0][free].sum()), int(free.sum())
+
+
+def as_pair(shares: np.ndarray) -> tuple[float, float]:
+    """The least and the largest of some seeds."""
+    return float(shares.min()), float(shares.max())
+
+
+def silent(result: Result) -> dict[str, Any]:
+    """Route optimality without a message as a finding: Wilson's interval, and whether it has committed."""
+    chosen = optimal(result)
+    low, high = stats.wilson(chosen.sum(), len(chosen))
+    holds = commitment(result)[1] >= COMMITTED
+    found = {"value": chosen.mean(), "low": low, "high": high, "n": len(chosen)}
+    return found | {"test": "committed to one corridor", "holds": holds}
+
+
+class Diagnosis(NamedTuple):
+    """What the bit does to each oracle-bit navigator without noise."""
+
+    shift: Float[np.ndarray, "seeds 2"]  # of the lateral mean if the bit flips, policy sds: approach, whole episode
+    incumbent: Float[np.ndarray, " seeds"]  # share entering the incumbent first, both placements and both bits
+    succeeded: Int[np.ndarray, "seeds 2"]  # incumbent corridor free: told the truth, told the opposite
+    free: int  # episodes behind each of those counts
+    episodes: int  # over all seeds, placements and bits
+
+
+def bit_diagnosis(flips: Mapping[tuple[str, bool], Sequence[Result]], incumbents: Sequence[int]) -> Diagnosis:
+    """From `Transfer.flipped` and every seed's incumbent corridor."""
+    shift = [np.concatenate([r[i]["shift"][0] for r in flips.values()]).mean(0) for i in range(len(incumbents))]
+    first = [np.concatenate([r[i]["first"][0] for r in flips.values()]) == side for i, side in enumerate(incumbents)]
+    succeeded = [
+        [flips[SIDES[1 - side], true][i]["success"][0].sum() for true in (True, False)]
+        for i, side in enumerate(incumbents)
+    ]
+    free = flips[SIDES[0], True][0]["success"].size
+    return Diagnosis(np.array(shift), np.mean(first, axis=1), np.array(succeeded, np.int64), free, sum(map(len, first)))
+
+
+def bit_table(diagnosis: Diagnosis) -> pd.DataFrame:
+    """A line an oracle-bit navigator."""
+    columns = {
+        "shift of the lateral mean, approach (sd)": diagnosis.shift[:, 0],
+        "whole episode (sd)": diagnosis.shift[:, 1],
+        "enters the incumbent": diagnosis.incumbent,
+        "success, true bit": diagnosis.succeeded[:, 0] / diagnosis.free,
+        "success, flipped bit": diagnosis.succeeded[:, 1] / diagnosis.free,
+    }
+    return pd.DataFrame(columns, index=pd.Index(range(len(diagnosis.shift)), name="seed")).round(3)
+
+
+def judge_bit(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Success told the truth and told the opposite as a finding, pooled counts, Fisher's exact test of a fall."""
+    true, flipped = map(int, diagnosis.succeeded.sum(axis=0))
+    n = diagnosis.free * len(diagnosis.succeeded)
+    p = stats.drop_test(true, flipped, n)
+    low, high = np.transpose([stats.wilson(count, n) for count in (true, flipped)])
+    found = {"value": (true / n, flipped / n), "low": low, "high": high, "n": n}
+    return found | {"test": "Fisher's exact test, flipped below true", "p": p, "holds": bool(p < 0.05)}
