@@ -45,6 +45,7 @@ BOOSTS = MappingProxyType(
         "none": Boost(),
     }
 )
+Flips = dict[tuple[str, bool], list[Result]]  # by blocked corridor, and whether told the truth
 SAMPLED, GREEDY = Exploration(window=0), Exploration(window=0, own=0.0)
 
 
@@ -78,41 +79,38 @@ class Transfer:
         changes = {"content": "latent"} | DIRECT[name] if name in DIRECT else OTHERS[name]
         return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | changes))
 
-    def evaluated(self, navigators: Mapping[str, list[Result]]) -> dict[str, list[Result]]:
-        """Each navigator with the slab at random; two rows, as it explores and without noise."""
+    def examined(self, navigators: Mapping[str, list[Result]]) -> tuple[dict[str, list[Result]], Flips]:
+        """The navigators frozen: with the slab at random, and those that are told the bit with it flipped.
+
+        The first has two rows, as it explores and without noise; the second is without noise, by case and seed.
+        """
         runs = {
             (name, i): self._roll(self._rollout(name, rows=(SAMPLED, GREEDY)), navigator)
             for name, results in navigators.items()
             for i, navigator in enumerate(results)
         }
-        results = dict(zip(runs, self.store.fetch(list(runs.values()), "evaluations"), strict=True))
-        return {name: [results[key] for key in runs if key[0] == name] for name in navigators}
-
-    def flipped(self, oracles: list[Result]) -> dict[tuple[str, bool], list[Result]]:
-        """The oracle-bit navigators without noise: by the blocked corridor, and whether they are told the truth."""
         cases = [(side, true) for side in SIDES for true in (True, False)]
         configs = [self._rollout("oracle", rows=(GREEDY,), blocked=side, truthful=true) for side, true in cases]
-        runs = [self._roll(config, navigator) for config in configs for navigator in oracles]
-        results = iter(self.store.fetch(runs, "flipped bits"))
-        return {case: [next(results) for _ in oracles] for case in cases}
+        flipped = [self._roll(config, navigator) for config in configs for navigator in navigators["oracle"]]
+        results = iter(self.store.fetch([*runs.values(), *flipped], "frozen navigators"))
+        evaluated = {name: [next(results) for _ in trained] for name, trained in navigators.items()}
+        return evaluated, {case: [next(results) for _ in navigators["oracle"]] for case in cases}
 
-    def swept(self, navigator: Result, blocked: str, groups: Sequence[tuple[Exploration, ...]]) -> list[Result]:
-        """A frozen navigator without a message under groups of rows of noise, the slab always in `blocked`."""
-        runs = [self._roll(self._rollout("silent", rows=rows, blocked=blocked), navigator) for rows in groups]
-        return self.store.fetch(runs, "coverage sweep")
+    def explored(
+        self, navigator: Result, blocked: str, groups: Sequence[tuple[Exploration, ...]]
+    ) -> tuple[list[Result], dict[str, Result]]:
+        """What becomes of a navigator without a message: frozen under imposed noise, and trained on with the bit.
 
-    def boosted(self, navigator: Result) -> dict[str, Result]:
-        """Training goes on from a silent navigator, now with the oracle's bit, by what becomes of the boost."""
-        runs = [
-            Run(
-                train_navigator,
-                self._config("oracle").model_copy(update={"boost": boost}),
-                SEED,
-                {"encoder": self.encoder, "start": _weights_only(navigator)},
-            )
+        The first is a result for every group of rows, the slab always in `blocked`; the second a training by boost.
+        """
+        swept = [self._roll(self._rollout("silent", rows=rows, blocked=blocked), navigator) for rows in groups]
+        inputs = {"encoder": self.encoder, "start": _weights_only(navigator)}
+        boosted = [
+            Run(train_navigator, self._config("oracle").model_copy(update={"boost": boost}), SEED, inputs)
             for boost in BOOSTS.values()
         ]
-        return dict(zip(BOOSTS, self.store.fetch(runs, "boosted trainings"), strict=True))
+        results = self.store.fetch([*swept, *boosted], "coverage sweep and boosted trainings")
+        return results[: len(swept)], dict(zip(BOOSTS, results[len(swept) :], strict=True))
 
     def _rollout(self, name: str, **changes: Any) -> RolloutConfig:
         trained = self._config(name)

@@ -129,7 +129,7 @@ def sweep(found: Mapping[str, Row], settings: Mapping[str, Exploration], paper: 
     axes.set_xticks(x, words)
     axes.set(ylim=(-0.03, 1.05), ylabel="share of episodes", xlabel="imposed lateral noise")
     axes.set_title("What exploration reaches, and what it costs. Bars: Wilson's 95% intervals", fontsize=11)
-    axes.legend(fontsize=8, ncols=3, loc="center left", bbox_to_anchor=(0.0, 0.62))
+    figure.legend(fontsize=8, loc="outside right upper")
     return figure
 
 

@@ -1,6 +1,7 @@
 """Figures and judgements of the direct transfer to velocity control (Section From Grid Actions)."""
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ def null(evaluated: Mapping[str, Sequence[Result]]) -> Figure:
     chance_line(upper)
     upper.set(ylim=(-0.03, 1.05), ylabel="route optimality")
     lower.set(ylim=(0, 1.05), ylabel="first corridor entered\n(blue left, orange right)")
-    lower.set_xticks(range(len(bars)), [name.replace(" ", "\n") for name, _ in bars], fontsize=8)
+    lower.set_xticks(range(len(bars)), [fill(name, 12) for name, _ in bars], fontsize=8)
     upper.set_title("A dot a training, Wilson's 95% interval. Lower pairs of bars: slab left, slab right", fontsize=11)
     return figure
 
@@ -71,7 +72,7 @@ def learning(trained: Mapping[str, Sequence[Result]], block: int) -> Figure:
                 means = [values[update // block == b].mean() if b in update // block else np.nan for b in blocks]
                 axes.plot((blocks + 0.5) * block, means, color=colour, ls=style, lw=1.4)
         chance_line(axes)
-        axes.set_title(name.replace(" ", "\n", 1), fontsize=9)
+        axes.set_title(fill(name, 12), fontsize=9)
         axes.set_xlabel("iteration", fontsize=8)
     panels[0].set(ylim=(-0.03, 1.05), ylabel="share of episodes")
     figure.suptitle("Solid: route optimality. Dashed: entered the left corridor first. Dotted: arrived", fontsize=10)
