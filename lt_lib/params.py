@@ -325,6 +325,7 @@ class RolloutConfig(Training):
     """Episodes of a frozen navigator, no learning."""
 
     content: str = "floor"
+    start: Literal["spawn", "left", "right"] = "spawn"  # or in front of a corridor's mouth
     blocked: Literal["random", "left", "right"] = "random"
     truthful: bool = True  # whether an oracle's message is true or flipped
     rows: Annotated[tuple[Exploration, ...], Field(min_length=1)] = (Exploration(),)

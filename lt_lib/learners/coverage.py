@@ -133,6 +133,14 @@ def _record(done: Episodes, arena: Arena, live: Bool[np.ndarray, " e"], age: int
     return live & ~arrived
 
 
+def started(layout: Layout, start: str) -> Layout:
+    """The layout with its spawn moved in front of the 'left' or 'right' corridor's mouth, or as it is for 'spawn'."""
+    if start == "spawn":
+        return layout
+    place = layout.choice_points[SIDES.index(start)].model_dump()
+    return layout.model_copy(update={"spawn": layout.spawn.model_copy(update=place)})
+
+
 def roll_navigator(
     config: RolloutConfig,
     seed: int,
@@ -154,7 +162,7 @@ def roll_navigator(
     )
     device = best_device(config.device)
     done = play(
-        load_layout(config.layout),
+        started(load_layout(config.layout), config.start),
         FrozenEncoder(encoder, device, config.precision),
         read_navigator(navigator),
         config.content,

@@ -6,7 +6,7 @@ What notebook 5 asks the run store for. Every navigator is trained with the same
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from lt_lib.envs.layout import SIDES
 from lt_lib.learners.coverage import roll_navigator
@@ -45,8 +45,15 @@ BOOSTS = MappingProxyType(
         "none": Boost(),
     }
 )
-Flips = dict[tuple[str, bool], list[Result]]  # by blocked corridor, and whether told the truth
 SAMPLED, GREEDY = Exploration(window=0), Exploration(window=0, own=0.0)
+
+
+class Examined(NamedTuple):
+    """Episodes of the frozen navigators, lists over trainings."""
+
+    spawn: dict[str, list[Result]]  # slab at random; two rows, as it explores and without noise
+    mouths: dict[str, list[list[Result]]]  # as it explores, from in front of the left and of the right, that one free
+    flips: dict[tuple[str, bool], list[Result]]  # without noise, by blocked corridor and whether told the truth
 
 
 @dataclass(frozen=True)
@@ -79,22 +86,27 @@ class Transfer:
         changes = {"content": "latent"} | DIRECT[name] if name in DIRECT else OTHERS[name]
         return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | changes))
 
-    def examined(self, navigators: Mapping[str, list[Result]]) -> tuple[dict[str, list[Result]], Flips]:
-        """The navigators frozen: with the slab at random, and those that are told the bit with it flipped.
+    def examined(self, navigators: Mapping[str, list[Result]]) -> Examined:
+        """The navigators frozen: from the spawn, from in front of either mouth, and with the oracle's bit flipped.
 
-        The first has two rows, as it explores and without noise; the second is without noise, by case and seed.
+        Every navigator meets draws of its own from the spawn, and one and the same draws in all cases of the bit.
         """
-        runs = {
-            (name, i): self._roll(self._rollout(name, rows=(SAMPLED, GREEDY)), navigator)
-            for name, results in navigators.items()
-            for i, navigator in enumerate(results)
-        }
+        everyone = [(name, navigator) for name, results in navigators.items() for navigator in results]
+        spawn = [self._roll(self._rollout(n, rows=(SAMPLED, GREEDY)), r, seed) for seed, (n, r) in enumerate(everyone)]
+        mouths = [
+            self._roll(self._rollout(n, rows=(SAMPLED,), start=side, blocked=other), r)
+            for n, r in everyone
+            for side, other in (SIDES, SIDES[::-1])
+        ]
         cases = [(side, true) for side in SIDES for true in (True, False)]
         configs = [self._rollout("oracle", rows=(GREEDY,), blocked=side, truthful=true) for side, true in cases]
         flipped = [self._roll(config, navigator) for config in configs for navigator in navigators["oracle"]]
-        results = iter(self.store.fetch([*runs.values(), *flipped], "frozen navigators"))
-        evaluated = {name: [next(results) for _ in trained] for name, trained in navigators.items()}
-        return evaluated, {case: [next(results) for _ in navigators["oracle"]] for case in cases}
+        results = iter(self.store.fetch([*spawn, *mouths, *flipped], "frozen navigators"))
+        return Examined(
+            {name: [next(results) for _ in trained] for name, trained in navigators.items()},
+            {name: [[next(results) for _ in SIDES] for _ in trained] for name, trained in navigators.items()},
+            {case: [next(results) for _ in navigators["oracle"]] for case in cases},
+        )
 
     def explored(
         self, navigator: Result, blocked: str, groups: Sequence[tuple[Exploration, ...]]
@@ -103,7 +115,7 @@ class Transfer:
 
         The first is a result for every group of rows, the slab always in `blocked`; the second a training by boost.
         """
-        swept = [self._roll(self._rollout("silent", rows=rows, blocked=blocked), navigator) for rows in groups]
+        swept = [self._roll(self._rollout("no choice", rows=rows, blocked=blocked), navigator) for rows in groups]
         inputs = {"encoder": self.encoder, "start": _weights_only(navigator)}
         boosted = [
             Run(train_navigator, self._config("oracle").model_copy(update={"boost": boost}), SEED, inputs)
@@ -117,8 +129,8 @@ class Transfer:
         shared = {key: getattr(trained, key) for key in ("layout", "device", "content", "precision")}
         return self.rollout.model_copy(update=shared | changes)
 
-    def _roll(self, config: RolloutConfig, navigator: Result) -> Run:
-        return Run(roll_navigator, config, SEED, {"encoder": self.encoder, "navigator": _weights_only(navigator)})
+    def _roll(self, config: RolloutConfig, navigator: Result, seed: int = SEED) -> Run:
+        return Run(roll_navigator, config, seed, {"encoder": self.encoder, "navigator": _weights_only(navigator)})
 
 
 def _weights_only(navigator: Result) -> Result:

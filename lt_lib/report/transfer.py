@@ -10,8 +10,9 @@ from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
 from lt_lib.envs.layout import SIDES
+from lt_lib.learners.coverage import EVERY
 from lt_lib.learners.navigator import LATERAL
-from lt_lib.learners.transfer import DIRECT
+from lt_lib.learners.transfer import DIRECT, Examined
 from lt_lib.report import stats
 from lt_lib.report.style import ROLES, chance_line
 from lt_lib.runs import Result
@@ -50,7 +51,7 @@ def optimal(result: Result, row: int = 0) -> np.ndarray:
 
 
 def commitment(result: Result, row: int = 0) -> tuple[int, float]:
-    """The incumbent: the corridor entered first in most episodes; and its least share under either placement."""
+    """The incumbent: the corridor entered first in most episodes; and least share under either placement."""
     first, slab = result["first"][row], result["slab"][row]
     incumbent = int((first == 1).sum() > (first == 0).sum())
     return incumbent, float(min((first[slab == s] == incumbent).mean() for s in np.unique(slab)))
@@ -79,11 +80,11 @@ def learning(trained: Mapping[str, Sequence[Result]], block: int) -> Figure:
     return figure
 
 
-def table(evaluated: Mapping[str, Sequence[Result]], trained: Mapping[str, Sequence[Result]]) -> pd.DataFrame:
+def table(examined: Examined, trained: Mapping[str, Sequence[Result]]) -> pd.DataFrame:
     """A line a training: route optimality and success as it explores and without noise, commitment, lateral noise."""
     lines = []
-    for name, results in evaluated.items():
-        for result, navigator in zip(results, trained[name], strict=True):
+    for name, results in examined.spawn.items():
+        for result, mouths, navigator in zip(results, examined.mouths[name], trained[name], strict=True):
             incumbent, share = commitment(result)
             free = result["slab"][1] != incumbent
             lines.append(
@@ -92,12 +93,24 @@ def table(evaluated: Mapping[str, Sequence[Result]], trained: Mapping[str, Seque
                     "route optimality": optimal(result).mean(),
                     "success": result["success"][0].mean(),
                     "incumbent": SIDES[incumbent],
-                    "its least share": share,
-                    "success, incumbent free, no noise": result["success"][1][free].mean() if free.any() else np.nan,
+                    "least share": share,
+                    "success, incumbent free": result["success"][1][free].mean() if free.any() else np.nan,
+                    "from the left mouth": mouths[0]["success"].mean(),
+                    "from the right mouth": mouths[1]["success"].mean(),
                     "lateral sigma": navigator["sigma"][-1, LATERAL],
                 }
             )
     return pd.DataFrame(lines).set_index("training").round(3)
+
+
+def held_command(result: Result, step: float, window: int) -> float:
+    """Mean sideways command toward the incumbent over the approach, without noise, as a share of full command.
+
+    Read off the kept paths: metres moved sideways in the first `window` control steps over what full command covers.
+    """
+    points = min(window // EVERY, result["path"].shape[-2] - 1)
+    moved = result["path"][1][:, points, 1] - result["path"][1][:, 0, 1]
+    return float(np.abs(np.nanmean(moved)) / (step * points * EVERY))
 
 
 def arrivals(result: Result) -> tuple[int, int]:
