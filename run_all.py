@@ -27,7 +27,11 @@ from lt_lib.preflight import check_inputs, settled
 from lt_lib.progress import Progress, read_progress
 
 # Without these the later notebook can only fail too; the scoreboard joins whatever is there.
-NEEDS = {"04_pixels": ("02_encoder",), "07_corruption": ("03_gridworld", "04_pixels")}
+NEEDS = {
+    "04_pixels": ("02_encoder",),
+    "05_coverage_sweep": ("02_encoder",),
+    "07_corruption": ("03_gridworld", "04_pixels"),
+}
 # What this script gives to every notebook, over what the profile says.
 GIVEN = ("profile", "outputs", "workers")
 # What names things that may not exist or not fit; checked before computing.

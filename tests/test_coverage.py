@@ -1,0 +1,294 @@
+"""Noise against its closed forms, the navigator without a route and its episodes against slow literal loops."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import spearmanr
+
+from lt_lib.comm.channel import ANCHOR
+from lt_lib.envs.arena import NO_CORRIDOR, Arena
+from lt_lib.envs.layout import load_layout
+from lt_lib.learners.coverage import Imposed, explore, play, started
+from lt_lib.learners.diagnostics import command_error, message_error
+from lt_lib.learners.episodes import draw_scenes
+from lt_lib.learners.navigator import LATERAL, Errand, Mailbox, Navigator, annealed, train_navigator
+from lt_lib.learners.noise import Ar1
+from lt_lib.learners.transfer import BOOSTS, DIRECT, OTHERS
+from lt_lib.params import Boost, Configuration, NavigatorConfig, RolloutConfig
+from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
+from lt_lib.report import coverage, transfer
+from lt_lib.report.claims import load_claims
+
+LAYOUT = load_layout("default")
+FOUR_SDS = 4.0  # of a Monte-Carlo estimate
+
+
+def quiet(_: float) -> None:
+    """A run's progress, unheard."""
+
+
+@pytest.fixture(scope="module")
+def weights() -> dict[str, np.ndarray]:
+    """A random encoder, normalised to nothing: enough where no perception is asked for."""
+    torch.manual_seed(0)
+    parts = {"E": Encoder(), "P": Predictor()}
+    arrays = {f"{p}.{k}": v.numpy() for p, m in parts.items() for k, v in m.state_dict().items()}
+    return arrays | {"mean": np.zeros(64, np.float32), "std": np.ones(64, np.float32)}
+
+
+@pytest.fixture(scope="module")
+def encoder(weights) -> FrozenEncoder:
+    return FrozenEncoder(weights)
+
+
+def driver(forward: float, across: float) -> Navigator:
+    """A navigator that commands one velocity whatever it sees."""
+    navigator = Navigator().requires_grad_(False)
+    navigator.velocity[-1].weight.zero_()
+    navigator.velocity[-1].bias.copy_(torch.tensor([forward, across, 0.0]))
+    return navigator
+
+
+# --- noise
+@pytest.mark.parametrize("tau", [0.0, 3.0, 30.0])
+def test_ar1_has_unit_variance_from_its_first_step_on_and_the_autocorrelation_of_its_correlation_time(tau):
+    n, lag = 40_000, 5
+    chains = Ar1(np.full(n, tau), np.random.default_rng(0))
+    x = np.stack([chains.step(np.full(n, t == 0)) for t in range(lag + 1)])
+    closed_form = np.exp(-lag / tau) if tau else 0.0
+    assert np.abs(x.var(axis=1) - 1).max() < FOUR_SDS * np.sqrt(2 / n)
+    assert abs((x[0] * x[lag]).mean() - closed_form) < FOUR_SDS * np.sqrt(2 / n)
+
+
+def test_a_fresh_chain_forgets_and_a_negative_correlation_time_is_refused():
+    n = 40_000
+    chains = Ar1(np.full(n, 1000.0), np.random.default_rng(1))
+    before, fresh = chains.step(np.ones(n, bool)), np.arange(n) < n // 2
+    after = chains.step(fresh)
+    assert abs((before * after)[fresh].mean()) < FOUR_SDS / np.sqrt(n / 2)
+    assert (before * after)[~fresh].mean() > 0.95
+    with pytest.raises(ValueError, match="must not be negative"):
+        Ar1(np.array([-1.0]), np.random.default_rng(0))
+
+
+def test_noise_is_imposed_on_the_lateral_axis_within_the_window_and_nowhere_else():
+    mean, std = torch.tensor([[0.1, 0.2, 0.3]]).repeat(4, 1), torch.tensor([0.5, 0.6, 0.7])
+    window, own = np.array([40, 40, 0, 0]), np.array([0.0, 1.0, 0.0, 1.0])
+    imposed = Imposed(np.full(4, 2.0), np.zeros(4), window, own)
+    action = explore(mean, std, imposed, np.full(4, 1.5), 10, np.random.default_rng(0))
+    theirs = np.random.default_rng(0).standard_normal((4, 3)) * std.numpy() * own[:, None]
+    theirs[:2, LATERAL] = 2.0 * 1.5
+    np.testing.assert_allclose(action, mean.numpy() + theirs, atol=1e-6)
+    np.testing.assert_allclose(action[2], mean[2], atol=1e-7)  # deterministic, outside the window
+
+
+# --- the navigator
+def test_every_condition_starts_as_the_navigator_without_a_message_and_can_leave_it():
+    navigator, latent = Navigator(), torch.randn(5, 64)
+    silent, spoken = (navigator.mean(latent, wire) for wire in (torch.zeros(5, 66), torch.randn(5, 66)))
+    assert torch.equal(silent, spoken)
+    navigator.mean(latent, torch.randn(5, 66)).sum().backward()
+    assert navigator.message.weight.grad.abs().min() > 0
+
+
+def test_the_boost_widens_the_lateral_axis_alone_and_only_the_critic_sees_the_slab():
+    navigator = Navigator()
+    observation = torch.cat([torch.randn(1, 130), torch.ones(1, 1), torch.tensor([[1.0, 0.0]])], dim=1)
+    boosted, moved = observation.clone(), observation.clone()
+    boosted[:, 130], moved[:, 131:] = 3.0, torch.tensor([[0.0, 1.0]])
+    ratio = navigator.policy(boosted).stddev / navigator.policy(observation).stddev
+    torch.testing.assert_close(ratio, torch.tensor([[1.0, 3.0, 1.0]]))
+    assert torch.equal(navigator.policy(moved).mean, navigator.policy(observation).mean)
+    assert not torch.equal(navigator.value(moved), navigator.value(observation))
+
+
+def test_the_boost_is_the_paper_s_at_iteration_80_and_never_less_than_none():
+    assert annealed(BOOSTS["annealed"], 80) == pytest.approx(load_claims()["cov.boost_scale"].paper, rel=1e-12)
+    assert annealed(BOOSTS["annealed"], 10_000) == 1.0 and annealed(Boost(), 7) == 1.0
+    assert {annealed(BOOSTS["held"], i) for i in (1, 80)} == {BOOSTS["held"].first}
+
+
+def test_a_message_is_late_by_the_latency_and_held_while_its_anchor_moves(encoder):
+    n, rng = 6, np.random.default_rng(0)
+    arena, mailbox, scenes = Arena(LAYOUT, n), Mailbox(LAYOUT, encoder, "oracle", n), draw_scenes(LAYOUT, n, rng)
+    slab, everyone = np.arange(n) % 2, np.ones(n, bool)
+    arena.reset(everyone, scenes.spawn, slab, scenes.scout)
+    mailbox.send(everyone, arena, 1 - slab)  # the truth is not what it is told
+    assert (mailbox.wires(arena, np.zeros(n, np.int64)) == 0).all()
+    first = mailbox.wires(arena, np.ones(n, np.int64))
+    arena.step(np.tile([1.0, 0.0, 0.0], (n, 1)))
+    second = mailbox.wires(arena, np.full(n, 2))
+    assert torch.equal(first[:, ANCHOR], torch.from_numpy(1 - slab).float())
+    assert torch.equal(first[:, ANCHOR:], second[:, ANCHOR:]) and not torch.equal(first[:, 0], second[:, 0])
+
+
+def test_diagnostics_find_a_message_intact_and_commands_obeyed(encoder):
+    rng = np.random.default_rng(0)
+    assert message_error(LAYOUT, encoder, 16, rng) < 1e-6
+    assert command_error(LAYOUT, 16, rng).max() < 0.01
+
+
+def test_rewards_are_distance_gained_through_the_nearer_corridor_plus_the_goal_less_the_slab(encoder):
+    n = 8
+    errand = Errand(NavigatorConfig(envs=n, hazard=3.0), encoder, np.random.default_rng(0))
+    arena, ahead = errand._arena, np.tile([1.0, 0.0, 0.0], (n, 1))
+    slab = np.arange(n) % 2
+    y = np.where(slab == 0, 0.4, -0.4)  # of the exits
+    pose = np.column_stack([np.full(n, 0.6), y, np.zeros(n)])  # before the slab
+    pose[4:, :2] = LAYOUT.goal.x - LAYOUT.goal.radius - 0.12, 0.0  # before the goal
+    arena.reset(np.ones(n, bool), pose, slab, arena.scout)
+    rewards = np.zeros(n)
+    for _ in range(5):
+        step = errand.step(ahead, boost=1.0)
+        rewards += np.where(rewards < -1, 0.0, step.rewards) * (rewards < 4)
+    gained = np.array([0.15] * 4 + [0.12] * 4)  # metres, within a step's travel
+    np.testing.assert_allclose(rewards, gained + np.array([-3.0] * 4 + [5.0] * 4), atol=0.06)
+    away = np.tile([-1.0, 0.0, 0.0], (n, 1))
+    arena.reset(np.ones(n, bool), np.tile([-2.0, 0.0, 0.0], (n, 1)), slab, arena.scout)
+    arena.step(away)
+    before = np.array([errand._distance(arena.pose[:, :2], np.full(n, side)) for side in (0, 1)]).min(axis=0)
+    step = errand.step(away, boost=1.0)
+    after = np.array([errand._distance(arena.pose[:, :2], np.full(n, side)) for side in (0, 1)]).min(axis=0)
+    np.testing.assert_allclose(step.rewards, before - after, atol=1e-9)
+    assert (step.rewards < -0.02).all() and not step.ended.any()
+
+
+def test_the_curriculum_starts_past_the_mouths_and_the_decision_is_met_from_the_spawn_alone(encoder):
+    pose = Errand(NavigatorConfig(envs=400), encoder, np.random.default_rng(0))._arena.pose
+    near = pose[:, 0] <= LAYOUT.barrier[0]
+    assert (np.abs(pose[near, :2] - LAYOUT.spawn.array[:2]) <= LAYOUT.spawn.jitter[0] + 1e-9).all()
+    assert 0.5 < near.mean() < 0.8  # draws of the free arena before the mouths go to the spawn too
+    shown = Errand(NavigatorConfig(envs=400, starts="anywhere"), encoder, np.random.default_rng(0))._arena.pose
+    assert ((shown[:, 0] <= LAYOUT.barrier[0]) & (np.abs(shown[:, 1]) > 0.5)).sum() > 20
+
+
+def test_training_repeats_itself_goes_on_from_where_another_stood_and_logs_only_episodes_from_the_spawn(weights):
+    config = NavigatorConfig(steps=512, envs=4, rollout=64, blocked="right", content="oracle")
+    once, again = (train_navigator(config, 0, report=quiet, encoder=weights) for _ in range(2))
+    assert all(np.array_equal(once[name], again[name]) for name in once)
+    assert len(once["boost"]) == 2 and (once["episodes"][:, 1] == 1).all()
+    still = train_navigator(config.model_copy(update={"lr": 1e-12}), 0, report=quiet, encoder=weights, start=once)
+    names = [name for name in once if name.startswith("navigator.")]
+    assert all(np.allclose(still[name], once[name], atol=1e-6) for name in names)
+
+
+# --- episodes
+def test_episodes_equal_a_literal_loop_of_one_robot_at_a_time(encoder):
+    n, horizon, across = 8, 150, 1.0
+    slab = np.arange(n) % 2
+    imposed = Imposed(np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n))
+    played = play(LAYOUT, encoder, driver(0.8, across), "floor", slab, slab, imposed, horizon, np.random.default_rng(5))
+    scenes = draw_scenes(LAYOUT, n, np.random.default_rng(5))
+    for i in range(n):
+        arena, first, entered = Arena(LAYOUT, 1), NO_CORRIDOR, [False, False]
+        arena.reset(np.ones(1, bool), scenes.spawn[[i]], slab[[i]], scenes.scout[[i]])
+        for t in range(horizon):
+            if t % 4 == 0:
+                np.testing.assert_allclose(played.path[i, t // 4], arena.pose[0, :2], atol=1e-6)
+            arena.step(np.array([[0.8, across, 0.0]]))
+            corridor = arena.corridor[0]
+            first = corridor if first == NO_CORRIDOR else first
+            if corridor != NO_CORRIDOR:
+                entered[corridor] = True
+        assert first == played.first[i] and entered == played.entered[i].tolist()
+    assert {0, NO_CORRIDOR} & set(played.first) and not played.success.any() and (played.length == horizon).all()
+
+
+def test_an_episode_ends_at_the_goal_and_the_others_go_on(encoder):
+    near = LAYOUT.model_copy(update={"goal": LAYOUT.goal.model_copy(update={"x": -1.9, "y": 0.0, "radius": 0.4})})
+    n = 12
+    imposed = Imposed(np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n))
+    slab = np.zeros(n, np.int64)
+    played = play(near, encoder, driver(1.0, 0.0), "floor", slab, slab, imposed, 40, np.random.default_rng(0))
+    assert 0 < played.success.sum() and (played.length[played.success] < 40).all()
+    ended = played.length[played.success][0]
+    path = played.path[played.success][0]
+    assert np.isfinite(path[: -(-ended // 4)]).all() and np.isnan(path[-(-ended // 4) :]).all()
+
+
+def test_a_navigator_s_bit_shift_is_that_of_its_mean_in_its_own_standard_deviations(encoder):
+    navigator = driver(0.0, 0.0)
+    navigator.message.weight[:, ANCHOR] = 1.0  # reads the bit
+    n = 3
+    imposed = Imposed(np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n))
+    slab = np.zeros(n, np.int64)
+    deaf = play(LAYOUT, encoder, navigator, "oracle", slab, slab, imposed, 8, np.random.default_rng(0))
+    assert (deaf.shift == 0).all()  # its output layer ignores what the receiver makes of it
+    navigator.velocity = torch.nn.Linear(96, 3)
+    torch.nn.init.zeros_(navigator.velocity.weight)
+    navigator.velocity.weight.requires_grad_(False)[LATERAL, 64] = 0.5
+    hears = play(LAYOUT, encoder, navigator, "oracle", slab, slab, imposed, 8, np.random.default_rng(0))
+    expected = 0.5 / np.exp(-0.5) * 7 / 8  # nothing has arrived at the first of the eight steps
+    np.testing.assert_allclose(hears.shift, expected, rtol=1e-5)
+
+
+def test_episodes_can_start_in_front_of_either_mouth_and_share_all_else():
+    for start, side in (("left", 1), ("right", -1)):
+        moved = started(LAYOUT, start)
+        spawn = moved.spawn.sample(50, np.random.default_rng(0))
+        assert (spawn[:, 1] * side > 1).all() and (np.abs(spawn[:, 0] + 1.8) <= LAYOUT.spawn.jitter[0]).all()
+        assert moved.walls == LAYOUT.walls
+    assert started(LAYOUT, "spawn") is LAYOUT
+
+
+# --- judgements
+def test_the_window_ratio_is_the_paper_s_and_grows_linearly_with_the_boost():
+    assert coverage.window_ratio(560, 40) == load_claims()["cov.window_ratio"].paper
+    assert coverage.window_ratio(560, 40, 3.6) == pytest.approx(14 * 3.6)
+    with pytest.raises(ValueError, match="window_ratio"):
+        coverage.window_ratio(560, 0)
+
+
+def test_opposition_enumerates_every_order_ties_included():
+    rows = [coverage.Row(128, c, s, 0) for c, s in ((0, 90), (0, 80), (3, 80), (9, 20), (8, 30), (20, 10))]
+    rho, p = coverage.opposition(rows)
+    x, y = np.array([row.shares for row in rows]).T
+    assert rho == pytest.approx(spearmanr(x, y).statistic)
+    rng = np.random.default_rng(0)
+    shuffled = np.mean([spearmanr(x, rng.permutation(y)).statistic <= rho + 1e-9 for _ in range(400)])
+    assert abs(p - shuffled) < 0.03
+    straight = [coverage.Row(128, i, 128 - i, 0) for i in range(7)]
+    assert coverage.opposition(straight) == (pytest.approx(-1), pytest.approx(1 / 5040))
+    assert coverage.opposition([coverage.Row(9, 0, 5, 5)] * 7) == (0.0, 1.0)
+
+
+def test_rows_count_coverage_success_and_success_off_the_alternative():
+    entered = np.zeros((1, 4, 2), bool)
+    entered[0, :, 1] = [True, True, False, False]
+    swept = {"entered": entered, "success": np.array([[True, False, True, False]])}
+    assert coverage.rows(swept, alternative=1) == [coverage.Row(4, 2, 2, 1)]
+    assert coverage.rows(swept, alternative=1)[0].competence == 0.5
+    assert coverage.rows(swept, alternative=0)[0].shares == (0.0, 0.5)
+
+
+def test_alternative_success_counts_blocked_incumbents_between_the_edges():
+    rng = np.random.default_rng(0)
+    episodes = np.column_stack([rng.integers(0, 20, 300), *rng.integers(0, 2, (3, 300))])
+    result, edges = {"episodes": episodes, "boost": np.ones(20)}, (0, 7, 14)
+    for (low, high), (succeeded, n) in zip(
+        ((0, 7), (7, 14)), coverage.alternative_success(result, 1, edges), strict=True
+    ):
+        kept = [e for e in episodes if low <= e[0] < high and e[1] == 1]
+        assert (succeeded, n) == (sum(e[3] for e in kept), len(kept))
+
+
+def test_the_held_command_is_sideways_travel_over_full_command():
+    t = np.arange(0, 40, 4)
+    path = np.stack([0 * t, -0.02 * t], axis=1)[None]  # 0.02 m a step to the right, whatever happens forward
+    result = {"path": np.stack([path, path])}
+    assert transfer.held_command(result, step=0.05, window=30) == pytest.approx(0.4)
+    assert transfer.held_command(result, step=0.05, window=600) == pytest.approx(0.4)  # the path's end at the latest
+
+
+def test_entering_no_corridor_is_neither_optimal_nor_commitment():
+    result = {"first": np.array([[0, 0, -1, 0]]), "slab": np.array([[0, 1, 1, 0]])}
+    assert transfer.optimal(result).tolist() == [False, True, False, False]
+    assert transfer.commitment(result) == (0, 0.5)
+
+
+def test_settings_are_the_paper_s():
+    claims = load_claims()
+    assert RolloutConfig().episodes == claims["cov.episodes"].paper
+    assert tuple(DIRECT) == Configuration.__args__ and len(DIRECT) == claims["port.null"].n
+    assert set(transfer.COLOURS) == {*DIRECT, *OTHERS}
+    assert set(coverage.TABLE) | set(coverage.WINDOWED) <= set(claims)
