@@ -365,7 +365,7 @@ Budget = Annotated[int, Field(gt=0, multiple_of=BLOCK)]
 class PointMassConfig(Settings):
     """One stack of the point-mass study: every d with every sigma at one window length (Section Scalar predictor)."""
 
-    arm: Literal["gaussian", "no_signal", "categorical", "steps", "clamped"] = "gaussian"
+    arm: Literal["gaussian", "no_signal", "categorical", "unclamped"] = "gaussian"
     window: PositiveInt = 30  # control steps N
     distances: tuple[PositiveFloat, ...] = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.3)
     sigmas: tuple[PositiveFloat, ...] = (0.55, 1.0)
@@ -377,7 +377,7 @@ class PointMassConfig(Settings):
     budgets: Annotated[tuple[Budget, ...], Field(min_length=1)] = (
         1_000,
     )  # updates after which success is measured, in order; the last one ends the training
-    evaluation: PositiveInt = 32_768  # episodes of a measurement
+    evaluation: PositiveInt = 8_192  # episodes of a measurement
 
     @model_validator(mode="after")
     def _budgets_in_order(self) -> "PointMassConfig":
@@ -454,8 +454,8 @@ SECTIONS: dict[str, Any] = {
     "looks": Annotated[list[Budget], Field(min_length=1)],
     "sgd_rates": Annotated[list[PositiveFloat], Field(min_length=2)],
     "resamples": Annotated[int, Field(ge=2)],
-    "step_evaluation": PositiveInt,
     "singles": PositiveInt,
+    "timed_updates": Budget,
     "navigator": NavigatorConfig,
     "rollout": RolloutConfig,
     "oracle_seeds": PositiveInt,

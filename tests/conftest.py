@@ -11,6 +11,7 @@ if "DISPLAY" not in os.environ:
 torch.set_num_threads(1)  # as in a run's worker; two would fight over the cores
 
 import lt_lib.envs.raycast  # compiled code, imported before the checks so that they leave it alone
+import lt_lib.envs.windows
 import lt_lib.learners.grid_walks
 import lt_lib.learners.table_ppo  # noqa: F401
 

@@ -8,6 +8,7 @@ from scipy.stats import kstest, norm
 
 from lt_lib.envs import point_mass
 from lt_lib.envs.layout import load_layout
+from lt_lib.envs.windows import STREAMS, WORDS, normals
 from lt_lib.learners import predictor
 from lt_lib.learners.score_function import ARMS, BASELINES, Episodes, Stack, gradient, play, train_point_mass
 from lt_lib.params import BLOCK, PointMassConfig, UserError
@@ -30,12 +31,13 @@ def changed(config: PointMassConfig, **values) -> PointMassConfig:
 
 
 # --- the learner
-def test_score_function_gradient_is_the_closed_form_on_a_one_step_problem():
+@pytest.mark.parametrize("arm", ["gaussian", "unclamped"])  # d below 1: the clamp changes no outcome of a single step
+def test_score_function_gradient_is_the_closed_form_on_a_one_step_problem(arm):
     d, sigma, n = 0.3, 0.8, 2_000_000
     stack = Stack(1, np.array([[d]]), np.array([[sigma]]), np.array([[0]]))
     policy = np.array([[-0.2, 0.1]])
-    drawn = Episodes.draw(ARMS["gaussian"], stack, [np.random.default_rng(0)], (n,))
-    entered, score = play(ARMS["gaussian"], stack, policy, drawn)
+    (drawn,) = Episodes.batches(ARMS[arm], stack, [np.random.default_rng(0)], 1, n)
+    entered, score = play(ARMS[arm], stack, policy, drawn)
     rewards = point_mass.reward(entered, drawn.safe)
     # by message: P(enter) = Phi((mu - d) / sigma); message 1 earns it, message 0 loses it, each in half the episodes
     slope = norm.pdf((policy - d) / sigma) / sigma
@@ -48,7 +50,7 @@ def test_score_function_gradient_is_the_closed_form_on_a_one_step_problem():
 def test_categorical_gradient_is_the_closed_form():
     n, logit = 1_000_000, np.array([[0.9, 2.0]])  # far from even, so that a wrong centre of the score shows
     stack = Stack(3, np.array([[0.9]]), np.array([[1.0]]), np.array([[0]]))
-    drawn = Episodes.draw(ARMS["categorical"], stack, [np.random.default_rng(1)], (n,))
+    (drawn,) = Episodes.batches(ARMS["categorical"], stack, [np.random.default_rng(1)], 1, n)
     entered, score = play(ARMS["categorical"], stack, logit, drawn)
     rewards = point_mass.reward(entered, drawn.safe)
     found = gradient(drawn.message, score, rewards - rewards.mean(1, keepdims=True))
@@ -59,10 +61,17 @@ def test_categorical_gradient_is_the_closed_form():
 @pytest.mark.parametrize("name", ARMS)
 def test_the_message_tells_the_safe_side_but_in_the_control(name):
     stack = Stack(3, *(np.array([[value]]) for value in (0.5, 1.0, 0)))
-    drawn = Episodes.draw(ARMS[name], stack, [np.random.default_rng(4)], (10_000,))
+    (drawn,) = Episodes.batches(ARMS[name], stack, [np.random.default_rng(4)], 1, 10_000)
     agree = (drawn.message == drawn.safe).mean()
     assert agree == pytest.approx(0.5, abs=0.02) if name == "no_signal" else agree == 1.0
     assert drawn.safe.mean() == pytest.approx(0.5, abs=0.02)
+
+
+def noise_of(batch: Episodes, config: PointMassConfig) -> np.ndarray:
+    """One run's standard normals, (B,) of the windows' means or (B, N) of their steps."""
+    if config.arm == "unclamped":
+        return batch.chance[0]
+    return normals(batch.chance[0], config.batch * config.window).reshape(config.batch, config.window)
 
 
 def literal_run(config: PointMassConfig, d: float, sigma: float, seed: int) -> np.ndarray:
@@ -72,13 +81,12 @@ def literal_run(config: PointMassConfig, d: float, sigma: float, seed: int) -> n
     kind = {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[config.optimiser]
     optimiser, generators = kind([policy], lr=config.lr, maximize=True), stack.generators(config.arm, 0)
     for _ in range(config.budgets[-1] // BLOCK):
-        block = Episodes.draw(arm, stack, generators, (BLOCK, config.batch))
-        for message, safe, noise in zip(block.message[0], block.safe[0], block.noise[0], strict=True):
+        for batch in Episodes.batches(arm, stack, generators, BLOCK, config.batch):
             rewards, log_probs = [], []
-            for bit, side, eps in zip(message, safe, noise, strict=True):
+            for bit, side, eps in zip(batch.message[0], batch.safe[0], noise_of(batch, config), strict=True):
                 step = torch.distributions.Normal(policy[int(bit)], sigma if eps.ndim else sigma / config.window**0.5)
                 command = (step.loc + step.scale * torch.as_tensor(eps, dtype=torch.float64)).detach()
-                limit = 1.0 if config.arm == "clamped" else np.inf
+                limit = np.inf if config.arm == "unclamped" else 1.0
                 rewards.append(float((command.clamp(-limit, limit).mean() >= d) == side))
                 log_probs.append(step.log_prob(command).sum())
             advantage = torch.tensor(rewards).double() - np.mean(rewards)
@@ -89,7 +97,7 @@ def literal_run(config: PointMassConfig, d: float, sigma: float, seed: int) -> n
 
 
 @pytest.mark.parametrize(
-    ("arm", "optimiser"), [("gaussian", "adam"), ("gaussian", "sgd"), ("no_signal", "adam"), ("clamped", "adam")]
+    ("arm", "optimiser"), [("gaussian", "adam"), ("gaussian", "sgd"), ("no_signal", "adam"), ("unclamped", "adam")]
 )
 def test_a_stacked_run_equals_the_plain_loop_over_single_runs(arm, optimiser):
     config = changed(SMALL, arm=arm, optimiser=optimiser, budgets=(BLOCK,))
@@ -112,17 +120,37 @@ def test_a_run_is_the_same_to_the_last_bit_whatever_runs_beside_it(arm):
     assert len(np.unique(together["policy"][:, -1, 0])) == len(together["d"])  # no two runs share their draws
 
 
-def test_drawing_the_mean_of_a_window_is_drawing_its_steps():
+def test_the_mean_of_an_unclamped_window_has_the_distribution_and_the_score_of_its_steps():
     sigma, window, mean = 0.7, 12, 0.25
     stack = Stack(window, np.array([[0.5]]), np.array([[sigma]]), np.array([[0]]))
-    commands, scores = {}, {}
-    for name in ("gaussian", "steps"):
-        noise = ARMS[name].noise(np.random.default_rng(5), (20_000,), stack)[None]
-        commands[name], scores[name] = ARMS[name].act(np.full((1, 20_000), mean), noise, stack)
-        np.testing.assert_allclose(scores[name], window * (commands[name] - mean) / sigma**2, rtol=1e-4, atol=1e-4)
-        assert kstest(commands[name][0], norm(mean, sigma / np.sqrt(window)).cdf).pvalue > 0.01
-    clamped, _ = ARMS["clamped"].act(np.full((1, 1), 5.0), np.zeros((1, 1, window)), stack)
-    assert clamped.item() == 1.0  # no mean of clamped commands exceeds 1
+    noise = ARMS["unclamped"].chance(np.random.default_rng(5), (1, 20_000), stack)
+    command, score = ARMS["unclamped"].act(np.full((1, 20_000), mean), noise, stack)
+    np.testing.assert_allclose(score, window * (command - mean) / sigma**2)
+    assert kstest(command[0], norm(mean, sigma / np.sqrt(window)).cdf).pvalue > 0.01
+
+
+def test_commands_are_clamped_one_by_one_and_the_score_is_of_those_drawn():
+    sigma, window, mean = 1.4, 9, -0.3
+    stack = Stack(window, np.array([[0.5]]), np.array([[sigma]]), np.array([[0]]))
+    seeds = ARMS["gaussian"].chance(np.random.default_rng(5), (1, 4_000), stack)
+    command, score = ARMS["gaussian"].act(np.full((1, 4_000), mean), seeds, stack)
+    drawn = mean + sigma * normals(seeds[0], 4_000 * window).reshape(1, 4_000, window).astype(float)
+    np.testing.assert_allclose(command, np.clip(drawn, -1, 1).mean(-1), atol=1e-6)
+    np.testing.assert_allclose(score, ((drawn - mean) / sigma**2).sum(-1), atol=1e-4)
+
+
+def test_fast_normals_are_standard_normal_and_independent():
+    seeds = np.random.default_rng(8).integers(0, 2**32, (250, WORDS, STREAMS), dtype=np.uint32)
+    drawn = np.stack([normals(seed, 8_000) for seed in seeds]).astype(float)
+    assert np.abs(drawn).max() < 6  # 24 bits: sqrt(-2 ln 2^-25)
+    assert kstest(drawn.ravel(), norm.cdf).pvalue > 0.01
+    n = drawn.size
+    assert (np.abs(drawn) > 4).sum() == pytest.approx(2 * n * norm.sf(4), abs=4 * np.sqrt(2 * n * norm.sf(4)))
+    for values in (drawn, drawn**2):
+        centred = (values - values.mean()) / values.std()
+        assert abs(np.corrcoef(centred[:-1].ravel(), centred[1:].ravel())[0, 1]) < 4 / np.sqrt(n)  # seeds
+        for lag in (1, 2, STREAMS, 2 * STREAMS, 4_000):  # the two normals of a pair lie half the array apart
+            assert abs((centred[:, :-lag] * centred[:, lag:]).mean()) < 4 / np.sqrt(n / 2)
 
 
 def test_message_baseline_gives_no_gradient_where_all_episodes_of_a_message_end_alike():

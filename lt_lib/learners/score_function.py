@@ -7,17 +7,18 @@ A policy is two numbers, one for each message: the mean lateral command, or the 
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped, UInt32
 from scipy.special import expit
 
 from lt_lib.envs.point_mass import enters_alternative, reward
+from lt_lib.envs.windows import STREAMS, WORDS, clamped_windows
 from lt_lib.params import BLOCK, PointMassConfig
 
 Generators = list[np.random.Generator]
+CHUNK = 2_048  # episodes of an evaluation that are drawn at once, to bound the memory
 
 
 class Stack(NamedTuple):
@@ -48,41 +49,44 @@ class Stack(NamedTuple):
 class Arm(NamedTuple):
     """How a policy explores, and whether its message tells anything.
 
-    noise   (generator, episodes, stack) -> what chance decides about one run's episodes, (episodes, ...)
-    act     (chosen parameter (R, B), noise (R, B, ...), stack) -> mean command of the window and the score, (R, B) each
+    chance  (generator, (batches, episodes), stack) -> what chance decides about one run's batches, (batches, ...)
+    act     (chosen parameter (R, B), a batch's chance (R, ...), stack) -> window's mean command and score, (R, B) each
     signal  whether the message says which side is safe; if not, the side is drawn independently of it
     """
 
-    noise: Callable
+    chance: Callable
     act: Callable
     signal: bool = True
 
 
-def _mean_noise(rng: np.random.Generator, episodes: tuple[int, ...], stack: Stack) -> Float[np.ndarray, "..."]:
-    return rng.standard_normal(episodes)
+def _window_seeds(rng: np.random.Generator, batches: tuple[int, int], stack: Stack) -> UInt32[np.ndarray, "..."]:
+    return rng.integers(0, 2**32, (batches[0], WORDS, STREAMS), dtype=np.uint32)
+
+
+def _act_by_steps(mean: Float[np.ndarray, "r b"], seeds: UInt32[np.ndarray, "r w s"], stack: Stack):
+    """Every one of the N commands, clamped to full command at the actuator; the score is the unclamped policy's.
+
+    The score of the window is sum_t (a_t - mu) / sigma^2, the a_t as drawn.
+    """
+    means, noise = clamped_windows(seeds, mean, stack.sigma, stack.window)
+    return means, noise / stack.sigma
+
+
+def _mean_noise(rng: np.random.Generator, batches: tuple[int, int], stack: Stack) -> Float[np.ndarray, "n b"]:
+    return rng.standard_normal(batches)
 
 
 def _act_by_mean(mean: Float[np.ndarray, "r b"], noise: Float[np.ndarray, "r b"], stack: Stack):
-    """N iid commands through their mean, which is Gaussian and decides both the outcome and the score.
+    """N unclamped commands through their mean, which is Gaussian and decides both the outcome and the score.
 
-    The score of the window is sum_t (a_t - mu) / sigma^2 = N (mean_t a_t - mu) / sigma^2.
+    The score of the window is N (mean_t a_t - mu) / sigma^2.
     """
     root = np.sqrt(stack.window)
     return mean + noise * (stack.sigma / root), noise * (root / stack.sigma)
 
 
-def _step_noise(rng: np.random.Generator, episodes: tuple[int, ...], stack: Stack) -> Float[np.ndarray, "..."]:
-    return rng.standard_normal((*episodes, stack.window), dtype=np.float32)
-
-
-def _act_by_steps(mean: Float[np.ndarray, "r b"], noise: Float[np.ndarray, "r b n"], stack: Stack, limit: float):
-    """Every one of the N commands, clamped to +- limit at the actuator; the score is that of the unclamped policy."""
-    commands = mean[..., None] + stack.sigma[..., None] * noise
-    return np.clip(commands, -limit, limit).mean(-1), noise.sum(-1, dtype=float) / stack.sigma
-
-
-def _uniform(rng: np.random.Generator, episodes: tuple[int, ...], stack: Stack) -> Float[np.ndarray, "..."]:
-    return rng.random(episodes)
+def _uniform(rng: np.random.Generator, batches: tuple[int, int], stack: Stack) -> Float[np.ndarray, "n b"]:
+    return rng.random(batches)
 
 
 def _act_by_draw(logit: Float[np.ndarray, "r b"], noise: Float[np.ndarray, "r b"], stack: Stack):
@@ -93,40 +97,36 @@ def _act_by_draw(logit: Float[np.ndarray, "r b"], noise: Float[np.ndarray, "r b"
 
 
 ARMS = {
-    "gaussian": Arm(_mean_noise, _act_by_mean),
-    "no_signal": Arm(_mean_noise, _act_by_mean, signal=False),
+    "gaussian": Arm(_window_seeds, _act_by_steps),
+    "no_signal": Arm(_window_seeds, _act_by_steps, signal=False),
     "categorical": Arm(_uniform, _act_by_draw),
-    "steps": Arm(_step_noise, partial(_act_by_steps, limit=np.inf)),
-    "clamped": Arm(_step_noise, partial(_act_by_steps, limit=1.0)),
+    "unclamped": Arm(_mean_noise, _act_by_mean),
 }
 
 
 class Episodes(NamedTuple):
-    """What chance decides about episodes of R runs; a leading (R, ...) axis each."""
+    """What chance decides about a batch of B episodes of R runs."""
 
-    message: Bool[np.ndarray, "r ..."]
-    safe: Bool[np.ndarray, "r ..."]  # whether the alternative side is the safe one
-    noise: Float[np.ndarray, "r ..."]
+    message: Bool[np.ndarray, "r b"]
+    safe: Bool[np.ndarray, "r b"]  # whether the alternative side is the safe one
+    chance: Shaped[np.ndarray, "r ..."]
 
     @classmethod
-    def draw(cls, arm: Arm, stack: Stack, generators: Generators, shape: tuple[int, ...]) -> "Episodes":
-        """Each run's own draws, one run after another."""
+    def batches(cls, arm: Arm, stack: Stack, generators: Generators, count: int, size: int) -> "list[Episodes]":
+        """So many batches, each run's all in one draw of its own."""
         drawn = []
         for rng in generators:
-            message = rng.random(shape) < 0.5
-            safe = message if arm.signal else rng.random(shape) < 0.5
-            drawn.append((message, safe, arm.noise(rng, shape, stack)))
-        return cls(*map(np.stack, zip(*drawn, strict=True)))
-
-    def update(self, i: int) -> "Episodes":
-        """The batch of one update, (R, B), out of a block of them, (R, updates, B)."""
-        return Episodes(*(values[:, i] for values in self))
+            message = rng.random((count, size)) < 0.5
+            safe = message if arm.signal else rng.random((count, size)) < 0.5
+            drawn.append((message, safe, arm.chance(rng, (count, size), stack)))
+        message, safe, chance = (np.stack(values, axis=1) for values in zip(*drawn, strict=True))
+        return [cls(*batch) for batch in zip(message, safe, chance, strict=True)]
 
 
 def play(arm: Arm, stack: Stack, policy: Float[np.ndarray, "r 2"], episodes: Episodes):
     """Episodes under a policy: whether each entered the alternative side, and its score, (R, B) both."""
     chosen = np.where(episodes.message, policy[:, 1:], policy[:, :1])
-    command, score = arm.act(chosen, episodes.noise, stack)
+    command, score = arm.act(chosen, episodes.chance, stack)
     return enters_alternative(command, stack.d), score
 
 
@@ -151,7 +151,8 @@ def gradient(
 ) -> Float[np.ndarray, "r 2"]:
     """Score-function estimate of the gradient of the expected reward by the parameter of either message."""
     weighted = advantage * score
-    return np.stack([np.where(message, 0.0, weighted).mean(1), np.where(message, weighted, 0.0).mean(1)], axis=1)
+    told = weighted * message
+    return np.stack([(weighted - told).mean(1), told.mean(1)], axis=1)
 
 
 class Adam:
@@ -196,10 +197,8 @@ def train_point_mass(config: PointMassConfig, seed: int, *, report: Callable[[fl
     generators = stack.generators(config.arm, 0)
     kept, coverage = [], []
     for done in range(BLOCK, config.budgets[-1] + 1, BLOCK):
-        block = Episodes.draw(arm, stack, generators, (BLOCK, config.batch))
         shares = []
-        for i in range(BLOCK):
-            episodes = block.update(i)
+        for episodes in Episodes.batches(arm, stack, generators, BLOCK, config.batch):
             entered, score = play(arm, stack, policy, episodes)
             rewards = reward(entered, episodes.safe)
             advantage = rewards - baseline(episodes.message, rewards)
@@ -218,7 +217,10 @@ def success_rate(
     config: PointMassConfig, stack: Stack, policy: Float[np.ndarray, "r 2"], updates: int
 ) -> Float[np.ndarray, " r"]:
     """Share of `config.evaluation` fresh episodes on the safe side, the policy sampled as in training."""
-    arm = ARMS[config.arm]
-    episodes = Episodes.draw(arm, stack, stack.generators(config.arm, updates), (config.evaluation,))
-    entered, _ = play(arm, stack, policy, episodes)
-    return reward(entered, episodes.safe).mean(1)
+    arm, generators = ARMS[config.arm], stack.generators(config.arm, updates)
+    won = np.zeros(len(policy))
+    for start in range(0, config.evaluation, CHUNK):
+        (episodes,) = Episodes.batches(arm, stack, generators, 1, min(CHUNK, config.evaluation - start))
+        entered, _ = play(arm, stack, policy, episodes)
+        won += reward(entered, episodes.safe).sum(1)
+    return won / config.evaluation

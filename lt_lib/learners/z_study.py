@@ -4,7 +4,7 @@ The unit of training is a stack: all runs of one arm that share a window length.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from lt_lib.runs import Result, Run, RunStore
 
 SEED = 0  # of the first run of every setting
 CEILING = 0.95  # final success from which a run counts as solved
+CONTROL = 4  # times as many episodes measure the control, of which the paper prints the highest to three digits
 CHANCE = (0.45, 0.55)  # final success of a run at chance
 
 
@@ -83,48 +84,55 @@ class ZStudy:
     def updates(self) -> int:
         return self.config.budgets[-1]
 
-    def all_runs(self, rates: Sequence[float], step_evaluation: int) -> dict[str, Runs]:
-        """Every run of the study, by what is particular to it.
+    def parts(self, rates: Sequence[float]) -> dict[str, PointMassConfig]:
+        """What the study is made of, by what is particular to it; each part is trained at every window length.
 
         gaussian, categorical, no_signal  the three arms
-        steps, clamped                    Gaussian runs with every single step drawn, and with each clamped to full
-                                          command; measured over `step_evaluation` episodes
-        no_drift                          Gaussian runs with a baseline for each message: no gradient while the
-                                          episodes of a message all end alike
-        sgd <rate>                        Gaussian runs under plain gradient ascent
+        unclamped   Gaussian runs whose commands may be of any size
+        no_drift    those, with a baseline for each message: no gradient while a message's episodes all end alike
+        sgd <rate>  Gaussian runs under plain gradient ascent
         """
-        by_steps = {"evaluation": step_evaluation}
         particular = {
             "gaussian": {"budgets": tuple(self.looks)},
             "categorical": {"arm": "categorical"},
-            "no_signal": {"arm": "no_signal"},
-            "steps": {"arm": "steps", **by_steps},
-            "clamped": {"arm": "clamped", **by_steps},
-            "no_drift": {"baseline": "message"},
+            "no_signal": {"arm": "no_signal", "evaluation": CONTROL * self.config.evaluation},
+            "unclamped": {"arm": "unclamped"},
+            "no_drift": {"arm": "unclamped", "baseline": "message"},
             **{f"sgd {rate:g}": {"optimiser": "sgd", "lr": rate} for rate in rates},
         }
-        configs = {name: self.config.model_copy(update=changes) for name, changes in particular.items()}
-        stacks = [c.model_copy(update={"window": n}) for c, n in product(configs.values(), self.windows)]
-        results = self.store.fetch([Run(train_point_mass, stack, SEED) for stack in stacks], "point-mass runs")
+        return {name: self.config.model_copy(update=changes) for name, changes in particular.items()}
+
+    def all_runs(self, rates: Sequence[float]) -> dict[str, Runs]:
+        """Every run of the study, by the names of its parts."""
+        parts = self.parts(rates)
+        results = self.store.fetch([Run(train_point_mass, s, SEED) for s in self._stacks(parts)], "point-mass runs")
         each = _batched(results, len(self.windows))
-        return {name: self._joined(c, own) for (name, c), own in zip(configs.items(), each, strict=True)}
+        return {name: self._joined(part, own) for (name, part), own in zip(parts.items(), each, strict=True)}
+
+    def stacking_gain(self, rates: Sequence[float], singles: int, updates: int) -> tuple[float, float]:
+        """Processor seconds of the whole study, stacked and one run after another.
+
+        Every stack is timed over its first `updates` updates, in turns with `singles` of its runs alone.
+        """
+        stacked, alone = 0.0, 0.0
+        for stack in self._stacks(self.parts(rates)):
+            share = updates / stack.budgets[-1]
+            looks = max(round(stack.evaluation * len(stack.budgets) * share), 1)
+            short = stack.model_copy(update={"budgets": (updates,), "evaluation": looks})
+            grid = list(product(stack.distances, stack.sigmas))
+            chosen = [grid[i] for i in np.linspace(0, len(grid) - 1, singles).astype(int)]
+            each = [short.model_copy(update={"distances": (d,), "sigmas": (s,), "seeds": 1}) for d, s in chosen]
+            stacked += _seconds([short]) / share
+            alone += _seconds(each) / share * len(grid) * stack.seeds / singles
+        return stacked, alone
+
+    def _stacks(self, parts: Mapping[str, PointMassConfig]) -> list[PointMassConfig]:
+        return [part.model_copy(update={"window": n}) for part, n in product(parts.values(), self.windows)]
 
     def _joined(self, config: PointMassConfig, stacks: Sequence[Result]) -> Runs:
         window = np.repeat(self.windows, [len(stack["d"]) for stack in stacks])
         columns = (np.concatenate([stack[name] for stack in stacks]) for name in ("d", "sigma", "success", "coverage"))
         return Runs(window, *columns, config.budgets, config.seeds)
-
-
-def stacking_gain(config: PointMassConfig, singles: int, rounds: int = 3) -> tuple[float, float]:
-    """Processor seconds a run, stacked and one by one; `singles` runs of the stack stand for all. Medians of rounds."""
-    grid = list(product(config.distances, config.sigmas))
-    chosen = [grid[i] for i in np.linspace(0, len(grid) - 1, singles).astype(int)]
-    alone = [config.model_copy(update={"distances": (d,), "sigmas": (s,), "seeds": 1}) for d, s in chosen]
-    stacked, single = [], []
-    for _ in range(rounds):
-        stacked.append(_seconds([config]) / (len(grid) * config.seeds))
-        single.append(_seconds(alone) / singles)
-    return float(np.median(stacked)), float(np.median(single))
 
 
 def _batched(items: Sequence[Result], size: int) -> list[Sequence[Result]]:
