@@ -143,22 +143,23 @@ class Protocol:
     def redrawn_heads(
         self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result
     ) -> dict[str, list[Result]]:
-        """So many seeds of each row of REDRAWS among the names, trained live on the bank's scenes."""
-        inputs = _live_inputs(bank, encoder, executor)
-        runs = {
-            (name, seed): Run(train_redrawn_head, self._redrawn(name), seed, inputs)
-            for name, count in seeds.items()
-            if name in REDRAWS
-            for seed in range(count)
-        }
-        return self._by_name(runs, "redrawn heads")
+        """So many seeds of each row of REDRAWS among the names, trained live on the bank's scenes; and one seed each of
 
-    def live_reference(self, bank: Result, encoder: Result, executor: Result) -> Result:
-        """Two batches of live training with one draw an episode, in float32: the bank's, episode by episode."""
-        changes = {"precision": "float32", "episodes": 2 * self.redraw.batch}
-        config = self._redrawn("k0").model_copy(update=changes)
-        run = Run(train_redrawn_head, config, SEED, _live_inputs(bank, encoder, executor))
-        return self.store.fetch([run], "live reference")[0]
+        no bonus   the latent drawn at every step, without the entropy bonus that all rows share
+        float32    two batches with one draw an episode: the bank's, episode by episode
+        """
+        scenes = {name: bank[name] for name in ("spawn", "scout")}
+        inputs = {"scenes": scenes, "encoder": encoder, "executor": executor}
+        rows = {(name, seed): self._redrawn(name) for name in seeds if name in REDRAWS for seed in range(seeds[name])}
+        every, once = self._redrawn("k1"), self._redrawn("k0")
+        unrewarded = every.ppo.model_copy(update={"entropy": 0.0})
+        configs = {
+            ("no bonus", SEED): every.model_copy(update={"ppo": unrewarded}),
+            **rows,
+            ("float32", SEED): once.model_copy(update={"precision": "float32", "episodes": 2 * once.batch}),
+        }
+        runs = {key: Run(train_redrawn_head, config, key[1], inputs) for key, config in configs.items()}
+        return self._by_name(runs, "redrawn heads")
 
     def _by_name(self, runs: Mapping[tuple[str, int], Run], what: str) -> dict[str, list[Result]]:
         """The results of runs named (row, seed): a list of seeds a row."""
@@ -187,11 +188,6 @@ class Protocol:
     def _redrawn(self, name: str) -> RedrawConfig:
         row = REDRAWS[name]
         return self.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
-
-
-def _live_inputs(bank: Result, encoder: Result, executor: Result) -> dict[str, Result]:
-    scenes = {name: bank[name] for name in ("spawn", "scout")}
-    return {"scenes": scenes, "encoder": encoder, "executor": executor}
 
 
 def _weights_only(head: Result) -> Result:

@@ -16,8 +16,12 @@ from lt_lib.report.pixels import final_shares
 from lt_lib.report.style import ROLES, chance_line
 from lt_lib.runs import Result
 
-CREDIT_COLOURS = (ROLES["ours"], ROLES["upper bound"])
-CREDIT_WORDS = ("whole episode return (ours)", "discounted advantages (GAE)")
+# what stands beside a row to show what decides it: that row, a colour, and words
+BESIDE = {
+    "k30_gae": ("k30", ROLES["upper bound"], "discounted advantages (GAE)"),
+    "k1_gae": ("k1", ROLES["upper bound"], "discounted advantages (GAE)"),
+    "no bonus": ("k1", ROLES["diagnostic"], "no entropy bonus"),
+}
 
 
 def judge(name: str, shares: np.ndarray, once: np.ndarray, floor: np.ndarray) -> dict[str, Any]:
@@ -116,20 +120,28 @@ def curves(heads: Mapping[str, Sequence[Result]], batch: int) -> Figure:
     return figure
 
 
-def readings(heads: Mapping[str, Sequence[Result]], batch: int) -> Figure:
-    """Route optimality over training under either reading of a draw's credit, a panel a redraw rate, every seed."""
-    pairs = [(name, other) for name, other in ((name, f"{name}_gae") for name in heads) if other in heads]
-    figure = Figure(figsize=(5.4 * len(pairs) + 1, 4.2), layout="constrained")
-    for axes, pair in zip(figure.subplots(1, len(pairs), sharey=True, squeeze=False)[0], pairs, strict=True):
-        for name, colour, words in zip(pair, CREDIT_COLOURS, CREDIT_WORDS, strict=True):
+def what_decides(heads: Mapping[str, Sequence[Result]], batch: int) -> Figure:
+    """Route optimality and entropy of a draw over training, beside what else was tried; a column a row, every seed."""
+    rows = list(dict.fromkeys(row for name, (row, _, _) in BESIDE.items() if name in heads))
+    figure = Figure(figsize=(5.4 * len(rows) + 1, 6.6), layout="constrained")
+    panels = figure.subplots(2, len(rows), sharex=True, sharey="row", squeeze=False)
+    for (upper, lower), row in zip(panels.T, rows, strict=True):
+        lines = {row: (row, ROLES["ours"], "whole episode return, entropy bonus (ours)")} | BESIDE
+        for name, (beside, colour, words) in lines.items():
+            if beside != row or name not in heads:
+                continue
             for head in heads[name]:
-                shares = _by_batch(head["optimal"], batch)
-                axes.plot(np.arange(1, len(shares) + 1) * batch, shares, color=colour, lw=1.2, alpha=0.8)
-            axes.plot([], [], color=colour, label=words)
-        axes.set(title=REDRAWS[pair[0]].words, xlabel="training episodes", ylim=(0.3, 1.03))
-        chance_line(axes)
-        axes.legend(loc="lower right", fontsize=9)
-    figure.axes[0].set_ylabel("route optimality of a batch")
+                episodes = np.arange(1, len(head["entropy"]) + 1) * batch
+                upper.plot(episodes, _by_batch(head["optimal"], batch), color=colour, lw=1.2, alpha=0.8)
+                lower.plot(episodes, head["entropy"], color=colour, lw=1.2, alpha=0.8)
+            upper.plot([], [], color=colour, label=words)
+        upper.set(title=REDRAWS[row].words, ylim=(0.3, 1.03))
+        chance_line(upper)
+        upper.legend(loc="lower right", fontsize=9)
+        lower.axhline(np.log(2), color="black", ls="--", lw=0.8)
+        lower.set(xlabel="training episodes", ylim=(0, 0.72))
+    panels[0, 0].set_ylabel("route optimality of a batch")
+    panels[1, 0].set_ylabel("entropy of a draw (nats)\ndashed: uniform")
     return figure
 
 
