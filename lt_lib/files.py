@@ -2,10 +2,13 @@
 
 import contextlib
 import fcntl
+import hashlib
+import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from lt_lib.params import ROOT, UserError
 
@@ -52,6 +55,11 @@ def claimed(folder: Path) -> Iterator[None]:
         file.write(str(os.getpid()))
         file.flush()
         yield
+
+
+def content_digest(content: Mapping[str, Any]) -> str:
+    """sha256 of what a json file holds, which stands in it as its `sha256`; how it is laid out does not count."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def outputs_folder(outputs: str, profile: str) -> Path:
