@@ -49,7 +49,7 @@ def claimed(folder: Path) -> Iterator[None]:
         except BlockingIOError:
             file.seek(0)
             raise UserError(
-                f"process {file.read()} is writing in {folder}; wait for it or name another folder"
+                f"process {file.read()} is already writing in {folder}; wait for it or name another folder"
             ) from None
         file.truncate(0)
         file.write(str(os.getpid()))

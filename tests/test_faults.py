@@ -23,8 +23,11 @@ from toy_runs import ToyConfig, train_toy
 from lt_lib.files import claimed
 from lt_lib.manifest import write_manifest
 from lt_lib.params import UserError
+from lt_lib.progress import Reporter, stage, write_fraction
 from lt_lib.runs import Run, RunError, RunStore
 from run_all import code_digest
+
+LIMIT_S = 600  # on a busy machine
 
 
 def toys(count: int, **settings) -> list[Run]:
@@ -65,7 +68,7 @@ def kill_after(process: subprocess.Popen, seconds: float) -> None:
         below = psutil.Process(process.pid).children(recursive=True)
         process.kill()
         process.wait()
-        _, alive = psutil.wait_procs(below, timeout=20)
+        _, alive = psutil.wait_procs(below, timeout=LIMIT_S)
         assert not alive
 
 
@@ -73,14 +76,14 @@ def test_killed_at_ten_random_moments_it_ends_with_what_an_undisturbed_one_gives
     undisturbed = tmp_path / "undisturbed"
     shutil.copytree(project, undisturbed)
     began = time.monotonic()
-    assert start(undisturbed, count=8, seconds=0.1).wait(timeout=120) == 0
+    assert start(undisturbed, count=8, seconds=0.1).wait(timeout=LIMIT_S) == 0
     whole = time.monotonic() - began
     moments = random.Random(0)
     for _ in range(10):
         before = kept_files(project / "outputs" / "runs")
         kill_after(start(project, count=8, seconds=0.1), moments.uniform(0, whole))
         assert before.items() <= kept_files(project / "outputs" / "runs").items()
-    assert start(project, count=8, seconds=0.1).wait(timeout=120) == 0
+    assert start(project, count=8, seconds=0.1).wait(timeout=LIMIT_S) == 0
     assert losses(project, "02_encoder") == losses(undisturbed, "02_encoder")
     assert kept_files(project / "outputs" / "runs") == kept_files(undisturbed / "outputs" / "runs")
     assert json.loads((project / "outputs" / "smoke" / "manifest.json").read_text())["notebooks"]["02_encoder"]
@@ -106,8 +109,6 @@ def test_on_a_disk_that_fills_up_finished_runs_are_kept_and_the_others_follow_on
 
 
 def test_a_run_goes_on_where_its_progress_cannot_be_written(small_disk):
-    from lt_lib.progress import Reporter, stage, write_fraction
-
     with stage(small_disk, "toys", total=1) as (folder, finished):
         fill(small_disk)
         Reporter(lambda fraction: write_fraction(folder / "one.json", fraction))(0.5)
@@ -202,7 +203,7 @@ with claimed(pathlib.Path(sys.argv[1])):
 # --- edits
 
 EDIT = """source = Path("notebooks/NAME.ipynb")
-source.write_text(source.read_text().replace('result[\\"loss\\"]', '0.5'))"""
+source.write_text(source.read_text().replace("range(count)", "range(1)"))"""
 
 
 def test_a_notebook_edited_while_it_runs_has_failed_and_the_next_time_the_new_one_runs(project, capfd):
@@ -210,8 +211,9 @@ def test_a_notebook_edited_while_it_runs_has_failed_and_the_next_time_the_new_on
     assert smoke(project, "--only", "02") == 1
     complaint = "notebooks/02_encoder.ipynb was edited meanwhile; the same command executes the new one"
     assert complaint in capfd.readouterr().out
-    write_notebook(project, "02_encoder", COMPUTE, WRITE)
+    write_notebook(project, "02_encoder", COMPUTE.replace("range(count)", "range(1)"), WRITE)
     assert smoke(project, "--only", "02") == 0
+    assert len(losses(project, "02_encoder")) == 1
     assert len(journal(project)) == 2
 
 
