@@ -12,7 +12,7 @@ from pathlib import Path
 import distributed
 import numpy as np
 import pytest
-from toy_project import journal, kept_files, losses, wait_until
+from toy_project import LIMIT_S, journal, kept_files, losses, wait_until
 from toy_runs import ToyConfig, count_threads, train_toy
 
 from lt_lib import cluster
@@ -20,8 +20,6 @@ from lt_lib.params import ROOT, UserError
 from lt_lib.progress import read_progress
 from lt_lib.runs import Run, RunError, RunStore
 from run_all import main
-
-START_S = 120  # on a busy machine
 
 
 def dask(*arguments: str, library: Path = ROOT) -> subprocess.Popen:
@@ -38,8 +36,8 @@ class Cluster:
     def __init__(self, folder: Path) -> None:
         file = folder / "scheduler.json"
         self.processes = [dask("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))]
-        wait_until(file.exists, START_S)
-        self.client = distributed.Client(scheduler_file=str(file), timeout=START_S, set_as_default=False)
+        wait_until(file.exists, LIMIT_S)
+        self.client = distributed.Client(scheduler_file=str(file), timeout=LIMIT_S, set_as_default=False)
         self.address = self.client.scheduler.address
         for name in ("one", "two"):
             self.join(name)
@@ -49,13 +47,13 @@ class Cluster:
         count = len(self.client.nthreads())
         options = ["--name", name, "--nthreads", str(threads), "--no-nanny"]
         self.processes.append(dask("worker", self.address, *options, library=library))
-        wait_until(lambda: len(self.client.nthreads()) > count, START_S)
+        wait_until(lambda: len(self.client.nthreads()) > count, LIMIT_S)
         return self.processes[-1]
 
     def leave(self, worker: subprocess.Popen) -> None:
         count = len(self.client.nthreads())
         worker.kill()
-        wait_until(lambda: len(self.client.nthreads()) < count, START_S)
+        wait_until(lambda: len(self.client.nthreads()) < count, LIMIT_S)
 
     def busy(self) -> list[str]:
         """The addresses of the workers that have a task."""
@@ -168,7 +166,7 @@ def fetch_in_the_background(folder: Path, small_cluster: Cluster, runs: list[Run
     """A fetch, once one of its runs tells that it is in the middle."""
     since = time.time()
     future = ThreadPoolExecutor(1).submit(RunStore(folder, small_cluster.address).fetch, runs, "toys")
-    wait_until(lambda: (now := read_progress(folder, since)) and now.fraction > now.done / now.total, START_S)
+    wait_until(lambda: (now := read_progress(folder, since)) and now.fraction > now.done / now.total, LIMIT_S)
     return future
 
 
@@ -177,16 +175,16 @@ def test_a_run_whose_worker_is_killed_in_the_middle_is_computed_by_another(small
     future = fetch_in_the_background(tmp_path, small_cluster, toys(1, seconds=2))
     (first,) = small_cluster.busy()
     os.kill(pids[first], signal.SIGKILL)
-    wait_until(lambda: small_cluster.busy() not in ([], [first]), 30)
-    (result,) = future.result(timeout=60)
+    wait_until(lambda: small_cluster.busy() not in ([], [first]), LIMIT_S)
+    (result,) = future.result(timeout=LIMIT_S)
     np.testing.assert_array_equal(result["weights"], np.random.default_rng(0).normal(size=(4, 3)))
     assert len((tmp_path / "journal.jsonl").read_text().splitlines()) == 1
 
 
 def test_a_lost_scheduler_is_named_and_finished_runs_are_kept(small_cluster, tmp_path):
     future = fetch_in_the_background(tmp_path, small_cluster, [*toys(1), *toys(3, seconds=2)])
-    wait_until(lambda: len(kept_files(tmp_path)) == 1, 30)
+    wait_until(lambda: len(kept_files(tmp_path)) == 1, LIMIT_S)
     small_cluster.processes[0].kill()
     with pytest.raises(RunError, match=f"3 of 4 runs failed.*lost the scheduler at {small_cluster.address}"):
-        future.result(timeout=60)
+        future.result(timeout=LIMIT_S)
     assert len(kept_files(tmp_path)) == 1

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from toy_project import COMPUTE, WRITE, journal, kept_files, losses, smoke, start, write_notebook
+from toy_project import COMPUTE, LIMIT_S, WRITE, journal, kept_files, losses, smoke, start, write_notebook
 from toy_runs import ToyConfig, train_toy
 
 from lt_lib.files import claimed
@@ -26,8 +26,6 @@ from lt_lib.params import UserError
 from lt_lib.progress import Reporter, stage, write_fraction
 from lt_lib.runs import Run, RunError, RunStore
 from run_all import code_digest
-
-LIMIT_S = 600  # on a busy machine
 
 
 def toys(count: int, **settings) -> list[Run]:

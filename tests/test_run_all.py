@@ -9,7 +9,7 @@ import nbformat
 import psutil
 import pytest
 from pydantic import TypeAdapter, ValidationError
-from toy_project import COMPUTE, RAISE, WRITE, journal, losses, smoke, start, wait_until, write_notebook
+from toy_project import COMPUTE, LIMIT_S, RAISE, WRITE, journal, losses, smoke, start, wait_until, write_notebook
 from toy_runs import ToyConfig, train_toy
 
 from lt_lib import params
@@ -268,12 +268,12 @@ def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_write
 def end_in_the_middle(root: Path, how: signal.Signals) -> subprocess.Popen:
     """Sends a signal once one run is kept and another in flight; returns when kernel and workers are gone."""
     process = start(root)
-    wait_until(lambda: len(journal(root)) == 1, seconds=60)
+    wait_until(lambda: len(journal(root)) == 1, seconds=LIMIT_S)
     below = psutil.Process(process.pid).children(recursive=True)
     assert len(below) >= 2, "expected a kernel and a worker"
     process.send_signal(how)
-    process.wait(timeout=20)
-    _, alive = psutil.wait_procs(below, timeout=10)
+    process.wait(timeout=LIMIT_S)
+    _, alive = psutil.wait_procs(below, timeout=LIMIT_S)
     assert not alive
     return process
 
@@ -282,7 +282,7 @@ def test_killed_in_the_middle_it_goes_on_without_repeating_a_finished_run(projec
     assert end_in_the_middle(project, signal.SIGKILL).returncode == -signal.SIGKILL
     kept = len(journal(project))
     assert kept < 3
-    assert start(project).wait(timeout=60) == 0
+    assert start(project).wait(timeout=LIMIT_S) == 0
     assert len(journal(project)) == 3
     assert sorted(line["seed"] for line in journal(project)) == [0, 1, 2]
     undisturbed = [train_toy(ToyConfig(), seed, report=lambda fraction: None)["loss"] for seed in range(3)]

@@ -10,6 +10,8 @@ import nbformat
 
 from run_all import main
 
+LIMIT_S = 600  # for what takes seconds, on a busy machine
+
 PARAMETERS = """profile = "smoke"
 outputs = ""
 workers = 0
