@@ -31,7 +31,7 @@ def dask(*arguments: str, library: Path = ROOT) -> subprocess.Popen:
 
 
 class Cluster:
-    """A scheduler and two workers of one thread."""
+    """A scheduler, and workers as they join."""
 
     def __init__(self, folder: Path) -> None:
         file = folder / "scheduler.json"
@@ -39,8 +39,6 @@ class Cluster:
         wait_until(file.exists, LIMIT_S)
         self.client = distributed.Client(scheduler_file=str(file), timeout=LIMIT_S, set_as_default=False)
         self.address = self.client.scheduler.address
-        for name in ("one", "two"):
-            self.join(name)
 
     def join(self, name: str, library: Path = ROOT, threads: int = 1) -> subprocess.Popen:
         """One more worker; returns once the scheduler has it."""
@@ -67,14 +65,46 @@ class Cluster:
 
 
 @pytest.fixture(scope="module")
-def small_cluster(tmp_path_factory):
+def scheduler(tmp_path_factory):
+    """A cluster without workers, until `small_cluster` is asked for."""
     made = Cluster(tmp_path_factory.mktemp("cluster"))
     yield made
     made.end()
 
 
+@pytest.fixture(scope="module")
+def small_cluster(scheduler):
+    for name in ("one", "two"):
+        scheduler.join(name)
+    return scheduler
+
+
 def toys(count: int, **settings) -> list[Run]:
     return [Run(train_toy, ToyConfig(**settings), seed) for seed in range(count)]
+
+
+def assert_refused(project: Path, capfd, address: str, *complaints: str) -> None:
+    assert main(["--profile", "smoke", "--scheduler", address], project) == 2
+    out, err = capfd.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    for complaint in complaints:
+        assert complaint in err
+    assert not (project / "outputs").exists()
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(project, capfd, monkeypatch):
+    monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
+    assert_refused(project, capfd, "tcp://127.0.0.1:9", "run_all: no Dask scheduler answers at tcp://127.0.0.1:9 ")
+
+
+def test_a_scheduler_without_workers_or_with_one_of_several_threads_is_one_line(scheduler, project, capfd, monkeypatch):
+    advice = f"has no workers; start some with `dask worker {scheduler.address} --nthreads 1`"
+    with monkeypatch.context() as patch:
+        patch.setattr(cluster, "ANSWER_S", 3)
+        assert_refused(project, capfd, scheduler.address, advice)
+    wide = scheduler.join("wide", threads=2)
+    assert_refused(project, capfd, scheduler.address, "has 2 threads; start it with --nthreads 1")
+    scheduler.leave(wide)
 
 
 def test_result_files_are_the_same_bytes_as_local_ones(small_cluster, tmp_path):
@@ -103,20 +133,6 @@ def test_a_failing_run_is_named_and_the_others_are_kept(small_cluster, tmp_path)
     with pytest.raises(RunError, match=r"1 of 3 .*train_toy\(seed=0, fails=True\): ValueError: this seed"):
         RunStore(tmp_path, small_cluster.address).fetch([*toys(1, fails=True), *toys(2)], "toys")
     assert len(kept_files(tmp_path)) == 2
-
-
-def assert_refused(project: Path, capfd, address: str, *complaints: str) -> None:
-    assert main(["--profile", "smoke", "--scheduler", address], project) == 2
-    out, err = capfd.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    for complaint in complaints:
-        assert complaint in err
-    assert not (project / "outputs").exists()
-
-
-def test_a_scheduler_that_does_not_answer_is_one_line(project, capfd, monkeypatch):
-    monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
-    assert_refused(project, capfd, "tcp://127.0.0.1:9", "run_all: no Dask scheduler answers at tcp://127.0.0.1:9 ")
 
 
 def test_a_worker_with_another_version_is_refused_with_both_versions(small_cluster, project, capfd, tmp_path):
