@@ -155,6 +155,18 @@ def test_the_error_of_a_deep_setting_names_its_place():
     assert explain(caught.value, "toy", dict) == "toy.a.1: must be a valid integer, got '2'"
 
 
+def test_an_unknown_setting_in_a_dict_or_list_of_settings_is_named_with_those_there_are():
+    class Shelf(params.Settings):
+        toys: dict[str, ToyConfig]
+        row: tuple[ToyConfig, ...] = ()
+
+    for bad, place in (({"toys": {"red": {"sise": 1}}}, "toys.red"), ({"toys": {}, "row": [{"sise": 1}]}, "row.0")):
+        with pytest.raises(ValidationError) as caught:
+            Shelf(**bad)
+        complaint = f"shelf.{place}.sise: unknown parameter; shelf.{place} has fails, seconds, size"
+        assert explain(caught.value, "shelf", Shelf) == complaint
+
+
 # --- executing
 
 

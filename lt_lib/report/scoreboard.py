@@ -100,13 +100,13 @@ def _read_results(path: Path, profile: str) -> _Results:
     try:
         content = dict(json.loads(path.read_bytes()))
         expected = content.pop("sha256", None)  # files of before it was kept have none
+        if expected not in (None, content_digest(content)):
+            raise UserError(f"{path.name}: is altered (it differs from its checksum); run its notebook again")
         results = _Results(**content)
     except ValidationError as error:
         raise UserError(explain(error, path.name, _Results)) from None
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"{path.name}: not a results file: {error}") from None
-    if expected not in (None, content_digest(content)):
-        raise UserError(f"{path.name}: is altered (it differs from its checksum); run its notebook again")
     if results.notebook != path.stem:
         raise UserError(f"{path.name}: was written by {results.notebook}")
     if results.profile != profile:
