@@ -57,11 +57,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.exit(run_all.main(sys.argv[2:], pathlib.Path(sys.argv[1])))"""
 
 
-def start(root: Path, count: int = 3, seconds: float = 1.5) -> subprocess.Popen:
-    """run_all in a process of its own, on notebook 02 with so many runs of so many seconds, one at a time."""
+def start(root: Path) -> subprocess.Popen:
+    """run_all in a process of its own, on notebook 02 with runs of 1.5 seconds, one at a time."""
     # The process has no settings for 'toy', so the notebook has it by default.
-    parameters = PARAMETERS.replace("toy = {}", f"toy = {{'seconds': {seconds}}}")
-    write_notebook(root, "02_encoder", COMPUTE, WRITE, parameters=parameters.replace("count = 2", f"count = {count}"))
+    parameters = PARAMETERS.replace("toy = {}", "toy = {'seconds': 1.5}").replace("count = 2", "count = 3")
+    write_notebook(root, "02_encoder", COMPUTE, WRITE, parameters=parameters)
     (root / "params" / "smoke.yaml").write_text("")
     command = [sys.executable, "-c", START, str(root), "--profile", "smoke", "--only", "02", "--workers", "1"]
     return subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
