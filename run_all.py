@@ -1,6 +1,7 @@
 """The whole reproduction: executes the notebooks in order and says how each went.
 
-    python run_all.py [--profile full|quick|smoke] [--only NAME ...] [--workers N] [--outputs DIR] [--list]
+    python run_all.py [--profile full|quick|smoke] [--only NAME ...] [--workers N | --scheduler ADDRESS]
+                       [--outputs DIR] [--list]
 
 Exit status: 0 all well, 1 a notebook failed, 2 bad input (nothing was computed), 130 interrupted.
 """
@@ -8,6 +9,8 @@ Exit status: 0 all well, 1 a notebook failed, 2 bad input (nothing was computed)
 import argparse
 import contextlib
 import csv
+import hashlib
+import json
 import logging
 import os
 import sys
@@ -20,10 +23,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from lt_lib.files import writable_folder
+from lt_lib.files import claimed, writable_folder
 from lt_lib.manifest import write_manifest
 from lt_lib.params import ROOT, UserError, load_profile, notebook_defaults, notebook_names
-from lt_lib.preflight import check_inputs, settled
+from lt_lib.preflight import check_cluster, check_inputs, settled
 from lt_lib.progress import Progress, read_progress
 
 # Without these the later notebook can only fail too; the scoreboard joins whatever is there.
@@ -41,12 +44,18 @@ CELL_LIMIT_S = 6 * 3600
 
 @dataclass(frozen=True)
 class Plan:
-    """What to execute, checked: notebooks in order, the parameters of each, and where everything goes."""
+    """What to execute, checked: notebooks in order, the parameters and the code of each, and where everything goes.
+
+    scheduler: the address of the Dask cluster that computes, '' for this machine
+    code: a digest of each notebook's code
+    """
 
     root: Path
     profile: str
     outputs: Path
+    scheduler: str
     parameters: Mapping[str, Mapping[str, Any]]
+    code: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -74,10 +83,14 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
             return 0
         plan = make_plan(options, root)
         preflight(plan)
-        outcomes = execute_all(plan)
+        with claimed(plan.outputs):
+            outcomes = execute_all(plan)
     except UserError as error:
         print(f"run_all: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # a disk that fills up, a folder that becomes read-only or goes away
+        print(f"run_all: {error}; finished runs are kept, the same command goes on from there", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         logging.getLogger("asyncio").disabled = True  # papermill's abandoned cell would complain at exit
         print(
@@ -93,11 +106,14 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--profile", default="full", help="a file of params/: full (default), quick or smoke")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels")
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)")
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="a Dask cluster's, tcp://HOST:PORT")
     parser.add_argument("--outputs", type=Path, metavar="DIR", help="default: outputs/<profile>")
     parser.add_argument("--list", action="store_true", help="name the notebooks and stop")
     options = parser.parse_args(arguments)
     if options.workers < 0:
         raise UserError(f"argument --workers: expected 0 or more, got {options.workers}")
+    if options.workers and options.scheduler:
+        raise UserError("argument --scheduler: its cluster has the workers; leave --workers out")
     return options
 
 
@@ -107,13 +123,23 @@ def make_plan(options: argparse.Namespace, root: Path) -> Plan:
     chosen = choose(options.only, list(profile)) if options.only else list(profile)
     # The default stays empty, so that executed notebooks do not depend on where the project lies.
     outputs = str(options.outputs.resolve()) if options.outputs else ""
-    given = dict(zip(GIVEN, (options.profile, outputs, options.workers), strict=True))
+    workers = options.scheduler or options.workers
+    given = dict(zip(GIVEN, (options.profile, outputs, workers), strict=True))
     return Plan(
         root=root,
         profile=options.profile,
         outputs=Path(outputs or root / "outputs" / options.profile),
+        scheduler=options.scheduler,
         parameters={name: settled(profile[name], root) | given for name in chosen},
+        code={name: code_digest(root, name) for name in chosen},
     )
+
+
+def code_digest(root: Path, name: str) -> str:
+    """sha256 of a notebook's code; its prose and outputs do not count."""
+    cells = json.loads((root / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    return hashlib.sha256(json.dumps(code).encode()).hexdigest()
 
 
 def choose(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -137,7 +163,10 @@ def preflight(plan: Plan) -> None:
         if inputs not in checked:  # notebooks share most of theirs
             check_inputs(inputs, plan.root)
             checked.append(inputs)
-    for folder in (plan.outputs, plan.root / "outputs" / "runs"):
+    if plan.scheduler:
+        check_cluster(plan.scheduler)
+    kept = [plan.outputs / name for name in ("logs", "notebooks", "results")]
+    for folder in (plan.outputs, *kept, plan.root / "outputs" / "runs"):
         writable_folder(folder)
 
 
@@ -162,14 +191,23 @@ def execute(plan: Plan, name: str) -> Outcome:
     results = plan.outputs / "results" / f"{name}.json"
     before = results.stat().st_mtime_ns if results.exists() else None
     started = time.time()
-    log.parent.mkdir(exist_ok=True)
     with log.open("w", encoding="utf-8") as file, live_line(name, plan.root / "outputs" / "runs"):
-        reason = run_papermill(plan, name, file)
+        reason = edited(plan, name) or run_papermill(plan, name, file)
     if not reason and (not results.exists() or results.stat().st_mtime_ns == before):
         reason = f"it ended without writing {shown(results, plan.root)}"
+    reason = reason or edited(plan, name)
     if reason:
         reason = f"{reason} (log: {shown(log, plan.root)})"
     return Outcome("FAILED" if reason else "ok", time.time() - started, reason)
+
+
+def edited(plan: Plan, name: str) -> str:
+    """What is wrong if a notebook's code is no longer the one that was checked: its outputs are not the code's."""
+    try:
+        same = code_digest(plan.root, name) == plan.code[name]
+    except (OSError, ValueError, KeyError, TypeError):  # it is gone, or half written
+        same = False
+    return "" if same else f"notebooks/{name}.ipynb was edited meanwhile; the same command executes the new one"
 
 
 def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
@@ -177,7 +215,6 @@ def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
     import papermill  # takes seconds, which bad input need not wait for
 
     executed = plan.outputs / "notebooks" / f"{name}.ipynb"
-    executed.parent.mkdir(exist_ok=True)
     try:
         # Relative paths, since papermill writes them into the executed notebook.
         with contextlib.chdir(plan.root), stderr_into(log):

@@ -1,6 +1,7 @@
 """What an outputs folder was made with: library versions, commit, machine, and seconds a notebook."""
 
 import json
+import logging
 import os
 import platform
 import re
@@ -20,7 +21,7 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
 
     notebooks: {name: {"status": text, "seconds": float}} of this time.
     """
-    earlier = json.loads(path.read_text(encoding="utf-8"))["notebooks"] if path.exists() else {}
+    earlier = _notebooks_in(path)
     commit = git_state(root)
     executed = {name: dict(entry) | commit for name, entry in notebooks.items()}
     manifest = {
@@ -30,6 +31,17 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
         "notebooks": dict(sorted((earlier | executed).items())),
     }
     write_atomically(path, (json.dumps(manifest, indent=2) + "\n").encode())
+
+
+def _notebooks_in(path: Path) -> dict[str, Any]:
+    """What an earlier manifest says of notebooks; nothing if there is none, or, with a warning, if it is damaged."""
+    if not path.exists():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["notebooks"])
+    except (ValueError, KeyError, TypeError):
+        logging.getLogger(__name__).warning("%s is damaged: it is written anew", path)
+        return {}
 
 
 def versions(requirements: Path) -> dict[str, str]:

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import (
@@ -153,11 +153,18 @@ def explain(error: ValidationError, name: str, settings: Any) -> str:
     first = error.errors()[0]
     place = ".".join([name, *map(str, first["loc"])])
     if first["type"] == "extra_forbidden":
-        for part in first["loc"][:-1]:  # settings inside settings
-            settings, name = settings.model_fields[part].annotation, f"{name}.{part}"
+        for part in first["loc"][:-1]:
+            settings, name = _inside(settings, part), f"{name}.{part}"
         return f"{place}: unknown parameter; {name} has {_listed(settings.model_fields)}"
     complaint = first["msg"].replace("Input should be", "must be")
     return f"{place}: {complaint}, got {first['input']!r}"
+
+
+def _inside(settings: Any, part: str | int) -> Any:
+    """The type of what settings have under a name, or of the items of a list or dict of settings."""
+    if hasattr(settings, "model_fields"):
+        return settings.model_fields[part].annotation
+    return next(kind for kind in reversed(get_args(settings)) if kind is not ...)
 
 
 def _listed(names: Any) -> str:

@@ -43,6 +43,14 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
         _check_gridworld(parameters)
 
 
+def check_cluster(address: str) -> None:
+    """Raises UserError, one line, unless a scheduler with workers of our versions answers at an address."""
+    from lt_lib.cluster import connected  # here, since Dask takes a second to import
+
+    with connected(address):
+        pass
+
+
 def _check_gridworld(parameters: Mapping[str, Any]) -> None:
     from lt_lib.comm.grid_wires import GRID_CONTENTS
     from lt_lib.envs.gridworld import Grid

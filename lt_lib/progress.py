@@ -18,16 +18,21 @@ from tqdm import tqdm
 
 
 class Reporter:
-    """What a run calls with its fraction done, 0 to 1; it is written down twice a second at most."""
+    """What a run calls with its fraction done, 0 to 1; it is passed on to `tell` twice a second at most."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._written = float("-inf")
+    def __init__(self, tell: Callable[[float], None]) -> None:
+        self._tell = tell
+        self._told = float("-inf")
 
     def __call__(self, fraction: float) -> None:
-        if time.monotonic() - self._written > 0.5:
-            _write(self._path, {"fraction": float(fraction)})
-            self._written = time.monotonic()
+        if time.monotonic() - self._told > 0.5:
+            self._tell(float(fraction))
+            self._told = time.monotonic()
+
+
+def write_fraction(path: Path, fraction: float) -> None:
+    """Leaves a run's fraction done in the file that belongs to it."""
+    _write(path, {"fraction": fraction})
 
 
 @contextlib.contextmanager
@@ -88,14 +93,16 @@ def _forget_ended(inflight: Path) -> None:
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    temporary = path.with_suffix(".new")
-    temporary.write_text(json.dumps(content), encoding="utf-8")
-    temporary.replace(path)
+    """Writes a file if it can: nothing is lost with it, and no run should be, say to a full disk."""
+    with contextlib.suppress(OSError):
+        temporary = path.with_suffix(".new")
+        temporary.write_text(json.dumps(content), encoding="utf-8")
+        temporary.replace(path)
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What a file tells; nothing if it went away meanwhile."""
+    """What a file tells; nothing if it went away meanwhile or is damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    except (FileNotFoundError, ValueError):
         return {}

@@ -13,10 +13,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import Future, as_completed
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,13 @@ from joblib.externals.loky import ProcessPoolExecutor
 
 from lt_lib.files import writable_folder, write_atomically
 from lt_lib.params import Settings
-from lt_lib.progress import Reporter, stage
+from lt_lib.progress import Reporter, stage, write_fraction
 from lt_lib.sources import source_digest
 
 Result = dict[str, Any]
+
+Packed = tuple[bytes, float]  # a packed result and the seconds it took
+Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run, given with its key
 
 # What a result may change with besides our own code.
 LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn")
@@ -88,18 +92,20 @@ class Run:
 class RunStore:
     """Finished runs in a folder, `<folder>/<function>/<key>.run`, and the workers that compute missing ones.
 
-    workers: processes at a time, 0 for one a core. Each has one thread, so that results do not depend on it.
+    workers: processes at a time on this machine, 0 for one a core; or a Dask scheduler's address, such as
+    tcp://127.0.0.1:8786, for the workers of its cluster. Each has one thread, so that results do not depend on it.
     """
 
     folder: Path
-    workers: int = 0
+    workers: int | str = 0
 
     def fetch(self, runs: Sequence[Run], what: str) -> list[Result]:
         """The results of `runs` in their order: finished ones are read, the others computed and kept.
 
         what: a few words for the progress line, e.g. 'route heads'.
 
-        Raises UserError if the folder cannot be written, RunError once all else is done if any run failed.
+        Raises UserError if the folder cannot be written or the cluster not be used, RunError once all else is done
+        if any run failed.
         """
         writable_folder(self.folder)
         keys = [run.key() for run in runs]
@@ -126,18 +132,16 @@ class RunStore:
         return unpack(payload)
 
     def _compute(self, missing: Mapping[str, Run], what: str) -> None:
-        """Computes runs in worker processes that start now, and so run the source that was digested."""
-        processes = min(self.workers or joblib.cpu_count(), len(missing))
-        journal = self.folder / "journal.jsonl"
+        """Has workers compute runs, and keeps each as soon as it is done."""
         failures = []
-        with stage(self.folder, what, len(missing)) as (progress, finished), _workers(processes) as pool:
-            futures = {
-                pool.submit(_compute_run, run, key, self._path(key, run), journal, progress / f"{key}.json"): key
-                for key, run in missing.items()
-            }
+        with (
+            stage(self.folder, what, len(missing)) as (progress, finished),
+            self._start(len(missing), progress) as submit,
+        ):
+            futures = {submit(key, run): key for key, run in missing.items()}
             for future in as_completed(futures):
                 key = futures[future]
-                if error := future.exception():
+                if error := self._end(key, missing[key], future):
                     failures.append((missing[key], error))
                 finished(key)
         if failures:
@@ -145,30 +149,57 @@ class RunStore:
             reason = f"{type(error).__name__}: {error}"
             raise RunError(f"{len(failures)} of {len(missing)} runs failed, first {run}: {reason}") from error
 
+    def _start(self, wanted: int, progress: Path) -> AbstractContextManager[Submit]:
+        """The workers for so many runs, whose progress goes into a folder."""
+        if isinstance(self.workers, str):
+            from lt_lib.cluster import cluster_workers  # here, since Dask takes a second to import
 
-def _compute_run(run: Run, key: str, path: Path, journal: Path, progress: Path) -> None:
-    """Computes one run in a worker, keeps it, and adds a line to the journal."""
+            return cluster_workers(self.workers, progress)
+        return _local_workers(min(self.workers or joblib.cpu_count(), wanted), progress)
+
+    def _end(self, key: str, run: Run, future: "Future[Packed]") -> BaseException | None:
+        """Keeps the result of a run that ended; what went wrong if it has none or cannot be kept."""
+        if future.cancelled():
+            return ConnectionError(f"lost the scheduler at {self.workers}")
+        if error := future.exception():
+            return error
+        try:
+            self._keep(key, run, *future.result())
+        except OSError as error:
+            return error
+        return None
+
+    def _keep(self, key: str, run: Run, payload: bytes, seconds: float) -> None:
+        """Writes a run's file, then its line in the journal."""
+        write_atomically(self._path(key, run), _checksum(payload) + b"\n" + payload)
+        line = {
+            "key": key,
+            "function": run.function.__name__,
+            "config": run.config.model_dump(mode="json"),
+            "seed": run.seed,
+            "seconds": round(seconds, 3),
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        with (self.folder / "journal.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def compute(run: Run, tell: Callable[[float], None]) -> Packed:
+    """Computes one run in a worker, which tells how far it is."""
     started = time.perf_counter()
-    payload = pack(run.function(run.config, run.seed, report=Reporter(progress), **run.inputs))
-    write_atomically(path, _checksum(payload) + b"\n" + payload)
-    line = {
-        "key": key,
-        "function": run.function.__name__,
-        "config": run.config.model_dump(mode="json"),
-        "seed": run.seed,
-        "seconds": round(time.perf_counter() - started, 3),
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    with journal.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")
+    payload = pack(run.function(run.config, run.seed, report=Reporter(tell), **run.inputs))
+    return payload, time.perf_counter() - started
 
 
 @contextlib.contextmanager
-def _workers(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes of one thread each, which end with the block or with this process, however it ends."""
+def _local_workers(processes: int, progress: Path) -> Iterator[Submit]:
+    """Worker processes of one thread each, which end with the block or with this process, however it ends.
+
+    They start now, and so run the source that was digested.
+    """
     pool = ProcessPoolExecutor(processes, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(),))
     try:
-        yield pool
+        yield lambda key, run: pool.submit(compute, run, partial(write_fraction, progress / f"{key}.json"))
     finally:
         pool.shutdown(wait=True, kill_workers=True)
 

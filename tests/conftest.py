@@ -3,6 +3,7 @@
 import os
 
 import jaxtyping
+import pytest
 import torch
 
 if "DISPLAY" not in os.environ:
@@ -16,3 +17,24 @@ import lt_lib.learners.grid_walks
 import lt_lib.learners.table_ppo  # noqa: F401
 
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A project's root with two notebooks that compute; they find our modules, and we their settings."""
+    from toy_project import COMPUTE, WRITE, write_notebook
+    from toy_runs import ToyConfig
+
+    from lt_lib import params
+
+    root = tmp_path / "project"
+    for folder in ("notebooks", "params"):
+        (root / folder).mkdir(parents=True)
+    for name in ("02_encoder", "03_gridworld"):
+        write_notebook(root, name, COMPUTE, WRITE)
+    (root / "params" / "smoke.yaml").write_text("shared: {count: 2}\n02_encoder: {toy: {size: 5}}\n")
+    (root / "params" / "claims.yaml").write_text("")
+    (root / "requirements.txt").write_text("numpy==2\n")
+    monkeypatch.setenv("PYTHONPATH", f"{params.ROOT}{os.pathsep}{params.ROOT / 'tests'}")
+    monkeypatch.setitem(params.SECTIONS, "toy", ToyConfig)
+    return root

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lt_lib.envs.layout import load_layout
+from lt_lib.files import content_digest
 from lt_lib.params import EncoderConfig, Gates, UserError
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, architecture
 from lt_lib.perception.frames import hazard_visible, random_rollouts
@@ -89,7 +90,16 @@ def test_weights_come_back_as_they_were_frozen(trained, tmp_path):
 
 
 def edit(path, **changes):
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    """Changes a sidecar as if it had been frozen so."""
+    sidecar = json.loads(path.read_text()) | changes
+    sidecar["sidecar_sha256"] = content_digest({name: sidecar[name] for name in sidecar if name != "sidecar_sha256"})
+    path.write_text(json.dumps(sidecar))
+
+
+def flip(path, place):
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
 
 
 @pytest.mark.parametrize(
@@ -103,6 +113,10 @@ def edit(path, **changes):
         (lambda f: (f / "encoder.json").write_text("{}"), "is no sidecar of frozen weights"),
         (lambda f: (f / "encoder.json").write_text("not json"), "is no sidecar of frozen weights"),
         (lambda f: (f / "encoder.safetensors").write_bytes(b"\0" * 100), "is truncated or altered"),
+        (lambda f: (f / "encoder.safetensors").write_bytes(b""), "is truncated or altered"),
+        (lambda f: flip(f / "encoder.safetensors", -1), "is truncated or altered"),
+        (lambda f: flip(f / "encoder.safetensors", 100), "is truncated or altered"),
+        (lambda f: flip(f / "encoder.json", (f / "encoder.json").read_bytes().index(b"0.97") + 3), "is altered"),
         (lambda f: edit(f / "encoder.json", kind="executor"), "holds a executor of format 1, not a encoder"),
         (lambda f: edit(f / "encoder.json", format=9), "of format 9, not a encoder of format 1"),
         (
@@ -113,7 +127,7 @@ def edit(path, **changes):
 )
 def test_weights_that_are_not_what_they_should_be_are_refused_in_one_line(trained, tmp_path, spoil, complaint):
     layout = load_layout("default")
-    save_frozen(tmp_path, "encoder", trained, layout, {})
+    save_frozen(tmp_path, "encoder", trained, layout, {"hazard": 0.97})
     spoil(tmp_path)
     with pytest.raises(UserError, match="^weights: ") as refused:
         load_frozen(tmp_path, "encoder", layout)

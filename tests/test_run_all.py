@@ -1,78 +1,21 @@
 """run_all.py from its command line, on a small project of its own: bad input, failures, kill and resume."""
 
 import json
-import os
 import signal
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import nbformat
 import psutil
 import pytest
 from pydantic import TypeAdapter, ValidationError
+from toy_project import COMPUTE, LIMIT_S, RAISE, WRITE, journal, losses, smoke, start, wait_until, write_notebook
 from toy_runs import ToyConfig, train_toy
 
 from lt_lib import params
-from lt_lib.params import ROOT, UserError, explain, load_profile
+from lt_lib.params import UserError, explain, load_profile
 from lt_lib.progress import Progress
 from run_all import choose, clock, describe, main
-
-PARAMETERS = """profile = "smoke"
-outputs = ""
-workers = 0
-count = 2
-share = 0.5
-content = "latent"
-sizes = [1, 2]
-toy = {}"""
-
-COMPUTE = """import json
-from pathlib import Path
-from toy_runs import ToyConfig, train_toy
-from lt_lib.runs import Run, RunStore
-store = RunStore(Path("outputs/runs"), workers)
-results = store.fetch([Run(train_toy, ToyConfig(**toy), seed) for seed in range(count)], "toys")"""
-
-WRITE = """path = Path(outputs or f"outputs/{profile}") / "results" / "NAME.json"
-path.parent.mkdir(exist_ok=True)
-path.write_text(json.dumps([result["loss"] for result in results]))"""
-
-RAISE = 'raise ValueError("the gate\\nfailed")'
-
-
-def write_notebook(root: Path, name: str, *cells: str, parameters: str = PARAMETERS) -> None:
-    first = nbformat.v4.new_code_cell(parameters, metadata={"tags": ["parameters"]})
-    rest = [nbformat.v4.new_code_cell(cell.replace("NAME", name)) for cell in cells]
-    kernel = {"name": "python3", "display_name": "Python 3"}
-    notebook = nbformat.v4.new_notebook(cells=[first, *rest], metadata={"kernelspec": kernel})
-    nbformat.write(notebook, root / "notebooks" / f"{name}.ipynb")
-
-
-@pytest.fixture
-def project(tmp_path, monkeypatch):
-    """A project's root with two notebooks that compute; they find our modules, and we their settings."""
-    root = tmp_path / "project"
-    for folder in ("notebooks", "params"):
-        (root / folder).mkdir(parents=True)
-    for name in ("02_encoder", "03_gridworld"):
-        write_notebook(root, name, COMPUTE, WRITE)
-    (root / "params" / "smoke.yaml").write_text("shared: {count: 2}\n02_encoder: {toy: {size: 5}}\n")
-    (root / "params" / "claims.yaml").write_text("")
-    (root / "requirements.txt").write_text("numpy==2\n")
-    monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{ROOT / 'tests'}")
-    monkeypatch.setitem(params.SECTIONS, "toy", ToyConfig)
-    return root
-
-
-def smoke(root: Path, *arguments: str) -> int:
-    return main(["--profile", "smoke", "--workers", "1", *arguments], root)
-
-
-def losses(root: Path, name: str) -> list[float]:
-    return json.loads((root / "outputs" / "smoke" / "results" / f"{name}.json").read_text())
-
 
 # --- bad input
 
@@ -124,6 +67,14 @@ def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml,
         ),
         (["--profile", "smoke", "--workers", "-1"], "argument --workers: expected 0 or more, got -1"),
         (["--profile", "smoke", "--workers", "two"], "argument --workers: invalid int value: 'two'"),
+        (
+            ["--profile", "smoke", "--workers", "2", "--scheduler", "tcp://localhost:8786"],
+            "argument --scheduler: its cluster has the workers; leave --workers out",
+        ),
+        (
+            ["--profile", "smoke", "--scheduler", "localhost"],
+            "expected a scheduler's address such as tcp://127.0.0.1:8786, got 'localhost'",
+        ),
         (["--profile", "smoke", "--fast"], "unrecognized arguments: --fast"),
         (["--profile", "smoke", "--outputs", "requirements.txt/out"], "cannot write in the folder "),
     ],
@@ -202,6 +153,18 @@ def test_the_error_of_a_deep_setting_names_its_place():
     with pytest.raises(ValidationError) as caught:
         TypeAdapter(dict[str, list[int]]).validate_python({"a": [1, "2"]}, strict=True)
     assert explain(caught.value, "toy", dict) == "toy.a.1: must be a valid integer, got '2'"
+
+
+def test_an_unknown_setting_in_a_dict_or_list_of_settings_is_named_with_those_there_are():
+    class Shelf(params.Settings):
+        toys: dict[str, ToyConfig]
+        row: tuple[ToyConfig, ...] = ()
+
+    for bad, place in (({"toys": {"red": {"sise": 1}}}, "toys.red"), ({"toys": {}, "row": [{"sise": 1}]}, "row.0")):
+        with pytest.raises(ValidationError) as caught:
+            Shelf(**bad)
+        complaint = f"shelf.{place}.sise: unknown parameter; shelf.{place} has fails, seconds, size"
+        assert explain(caught.value, "shelf", Shelf) == complaint
 
 
 # --- executing
@@ -293,10 +256,14 @@ def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(proje
     assert losses(project, "08_hardware_decode") == [1]
 
 
-def test_a_lost_kernel_is_a_failed_notebook(project, capfd):
-    write_notebook(project, "02_encoder", "import os\nos._exit(9)", WRITE)
+def test_a_lost_kernel_is_a_failed_notebook_whose_finished_runs_are_kept(project, capfd):
+    write_notebook(project, "02_encoder", COMPUTE, "import os\nos._exit(9)", WRITE)
     assert smoke(project, "--only", "encoder") == 1
     assert "FAILED" in capfd.readouterr().out
+    assert len(journal(project)) == 2
+    write_notebook(project, "02_encoder", COMPUTE, WRITE)
+    assert smoke(project, "--only", "encoder") == 0
+    assert len(journal(project)) == 2
 
 
 def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_writes_where_told(project, tmp_path):
@@ -309,40 +276,16 @@ def test_a_second_run_of_one_notebook_keeps_the_others_in_the_manifest_and_write
 
 # --- killing
 
-START = "import sys, pathlib, run_all; sys.exit(run_all.main(sys.argv[2:], pathlib.Path(sys.argv[1])))"
-
-
-def start(root: Path) -> subprocess.Popen:
-    """run_all in a process of its own, on notebook 02 with runs of 1.5 seconds, one at a time."""
-    # The process has no settings for 'toy', so the notebook has it by default.
-    parameters = PARAMETERS.replace("toy = {}", "toy = {'seconds': 1.5}").replace("count = 2", "count = 3")
-    write_notebook(root, "02_encoder", COMPUTE, WRITE, parameters=parameters)
-    (root / "params" / "smoke.yaml").write_text("")
-    command = [sys.executable, "-c", START, str(root), "--profile", "smoke", "--only", "02", "--workers", "1"]
-    return subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def journal(root: Path) -> list[dict]:
-    path = root / "outputs" / "runs" / "journal.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def wait_until(condition, seconds: float) -> None:
-    limit = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < limit, "waited in vain"
-        time.sleep(0.05)
-
 
 def end_in_the_middle(root: Path, how: signal.Signals) -> subprocess.Popen:
     """Sends a signal once one run is kept and another in flight; returns when kernel and workers are gone."""
     process = start(root)
-    wait_until(lambda: len(journal(root)) == 1, seconds=60)
+    wait_until(lambda: len(journal(root)) == 1, seconds=LIMIT_S)
     below = psutil.Process(process.pid).children(recursive=True)
     assert len(below) >= 2, "expected a kernel and a worker"
     process.send_signal(how)
-    process.wait(timeout=20)
-    _, alive = psutil.wait_procs(below, timeout=10)
+    process.wait(timeout=LIMIT_S)
+    _, alive = psutil.wait_procs(below, timeout=LIMIT_S)
     assert not alive
     return process
 
@@ -351,7 +294,7 @@ def test_killed_in_the_middle_it_goes_on_without_repeating_a_finished_run(projec
     assert end_in_the_middle(project, signal.SIGKILL).returncode == -signal.SIGKILL
     kept = len(journal(project))
     assert kept < 3
-    assert start(project).wait(timeout=60) == 0
+    assert start(project).wait(timeout=LIMIT_S) == 0
     assert len(journal(project)) == 3
     assert sorted(line["seed"] for line in journal(project)) == [0, 1, 2]
     undisturbed = [train_toy(ToyConfig(), seed, report=lambda fraction: None)["loss"] for seed in range(3)]

@@ -35,7 +35,7 @@ class GridProtocol:
     grid: GridConfig
 
     @classmethod
-    def of(cls, gridworld: Mapping, workers: int) -> "GridProtocol":
+    def of(cls, gridworld: Mapping, workers: int | str) -> "GridProtocol":
         """From a notebook's parameters."""
         section = GridworldConfig(**gridworld)
         there = {"layout": section.layout}

@@ -59,7 +59,7 @@ class Protocol:
 
     @classmethod
     def of(
-        cls, layout: str, device: str, workers: int, weights: str = "", shards: int = 8, **sections: Mapping
+        cls, layout: str, device: str, workers: int | str, weights: str = "", shards: int = 8, **sections: Mapping
     ) -> "Protocol":
         """From a notebook's parameters: `sections` are the dicts named as in params.SECTIONS."""
         shared = {"layout": layout, "device": device}

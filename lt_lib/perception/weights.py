@@ -9,7 +9,7 @@ import numpy as np
 import safetensors.numpy
 
 from lt_lib.envs.layout import Layout
-from lt_lib.files import write_atomically
+from lt_lib.files import content_digest, write_atomically
 from lt_lib.params import UserError
 
 FORMAT = 1
@@ -25,6 +25,7 @@ def save_frozen(folder: Path, kind: str, arrays: Mapping[str, np.ndarray], layou
         "layout": layout.model_dump(mode="json"),
         **facts,
     }
+    sidecar["sidecar_sha256"] = content_digest(sidecar)
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / f"{kind}.safetensors", payload)
     write_atomically(folder / f"{kind}.json", json.dumps(sidecar, indent=1).encode())
@@ -46,13 +47,16 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
     payload = path.read_bytes()
     try:
         sidecar = json.loads(sidecar_path.read_text(encoding="utf-8"))
+        expected = sidecar.pop("sidecar_sha256", None)  # sidecars of before it was kept have none
         found = (sidecar["kind"], sidecar["format"], sidecar["sha256"], sidecar["layout"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
             f"weights: {sidecar_path} is no sidecar of frozen weights ({error!r}); freeze them again"
         ) from error
     if found[:2] != (kind, FORMAT):
         raise UserError(f"weights: {path} holds a {found[0]} of format {found[1]}, not a {kind} of format {FORMAT}")
+    if expected not in (None, content_digest(sidecar)):
+        raise UserError(f"weights: {sidecar_path} is altered (it differs from its checksum); freeze them again")
     if hashlib.sha256(payload).hexdigest() != found[2]:
         raise UserError(
             f"weights: {path} is truncated or altered (checksum differs from {sidecar_path.name}'s); freeze it again"
@@ -67,4 +71,5 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
 def facts_of(folder: Path, kind: str) -> dict:
     """What was recorded with frozen weights that `load_frozen` has accepted: their settings and what they passed."""
     sidecar = json.loads((folder / f"{kind}.json").read_text(encoding="utf-8"))
-    return {name: value for name, value in sidecar.items() if name not in ("format", "kind", "sha256", "layout")}
+    beside = ("format", "kind", "sha256", "layout", "sidecar_sha256")
+    return {name: value for name, value in sidecar.items() if name not in beside}

@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from lt_lib.files import writable_folder, write_atomically
+from lt_lib.files import content_digest, writable_folder, write_atomically
 from lt_lib.params import ROOT, Settings, UserError, explain
 
 Notebook = Literal[
@@ -266,7 +266,8 @@ class Findings:
             if name in self.found
         }
         head = {"notebook": self.notebook, "profile": self.profile, "pending": sorted(pending)}
-        text = json.dumps({**head, "findings": entries}, indent=1, ensure_ascii=False) + "\n"
+        content = {**head, "findings": entries}
+        text = json.dumps({"sha256": content_digest(content), **content}, indent=1, ensure_ascii=False) + "\n"
         writable_folder(self.path.parent)
         write_atomically(self.path, text.encode())
         return self.path

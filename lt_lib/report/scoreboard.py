@@ -9,7 +9,7 @@ import pandas as pd
 from pandas.io.formats.style import Styler
 from pydantic import ValidationError
 
-from lt_lib.files import writable_folder, write_atomically
+from lt_lib.files import content_digest, writable_folder, write_atomically
 from lt_lib.params import Settings, UserError, explain
 from lt_lib.report.claims import (
     JUDGED,
@@ -98,7 +98,11 @@ def read_findings(outputs: Path, claims: Mapping[str, Claim], profile: str) -> d
 def _read_results(path: Path, profile: str) -> _Results:
     """One results file, checked by itself."""
     try:
-        results = _Results(**json.loads(path.read_bytes()))
+        content = dict(json.loads(path.read_bytes()))
+        expected = content.pop("sha256", None)  # files of before it was kept have none
+        if expected not in (None, content_digest(content)):
+            raise UserError(f"{path.name}: is altered (it differs from its checksum); run its notebook again")
+        results = _Results(**content)
     except ValidationError as error:
         raise UserError(explain(error, path.name, _Results)) from None
     except (OSError, ValueError, TypeError) as error:
