@@ -34,7 +34,9 @@ PAGE = """
 {%- block html_head_js -%}{%- endblock -%}
 {%- block html_head_js_mathjax -%}{%- endblock -%}
 {%- block html_head_js_mermaidjs -%}{%- endblock -%}
-{%- block body_header -%}{{ super() }}<p><a href="index.html">All notebooks</a></p>{%- endblock -%}
+{%- block body_header -%}{{ super() }}
+<p class="jp-RenderedHTMLCommon"><a href="index.html">scoreboard, figures and all notebooks</a></p>
+{%- endblock -%}
 {%- block data_png -%}{{ picture('image/png', output, resources) }}{%- endblock -%}
 {%- block data_other -%}{{ picture('image/gif', output, resources) }}{%- endblock -%}
 """
