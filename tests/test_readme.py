@@ -125,7 +125,7 @@ def test_what_the_readme_adds_works(what, tmp_path):
         source, target = ROOT / name, tmp_path / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", ".ipynb_checkpoints"))
+            shutil.copytree(source, target)  # with its compiled code, which takes a while to make
         else:
             shutil.copy2(source, target)
     options = {"cwd": tmp_path, "capture_output": True, "text": True, "timeout": LIMIT_S}
