@@ -171,7 +171,7 @@ def preflight(plan: Plan) -> None:
 
 
 def execute_all(plan: Plan) -> dict[str, Outcome]:
-    """Executes every notebook whose needs did not fail, prints a line each, and writes the manifest."""
+    """Executes every notebook whose needs did not fail, prints a line each, writes the manifest and the report."""
     outcomes: dict[str, Outcome] = {}
     for name in plan.parameters:
         failed = [need for need in NEEDS.get(name, ()) if need in outcomes and outcomes[need].status != "ok"]
@@ -181,6 +181,9 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
     entries = {name: {"status": each.status, "seconds": round(each.seconds, 1)} for name, each in outcomes.items()}
     write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, entries)
     if "09_scoreboard" in outcomes and outcomes["09_scoreboard"].status == "ok":
+        from lt_lib.report.html import write_report  # takes seconds, which bad input need not wait for
+
+        write_report(plan.outputs)
         print_summary(plan.outputs / "scoreboard.csv")
     return outcomes
 

@@ -18,9 +18,15 @@ def modules():
 
 
 def imports(path):
+    """The parts of lt_lib that a module imports, however it is written."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lt_lib."):
-            yield node.module.split(".")[1]
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path.name} imports relatively"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        yield from (name.split(".")[1] for name in names if name.startswith("lt_lib."))
 
 
 def test_imports_point_down_or_sideways():

@@ -224,8 +224,11 @@ def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd)
 def test_a_scoreboard_is_summed_up_in_the_last_line(project, capfd):
     rows = r"id,verdict\na,reproduced\nb,not run\nc,reproduced"
     table = f'Path("outputs/smoke/scoreboard.csv").write_text("{rows}")'
-    write_notebook(project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, WRITE)
+    text = 'Path("outputs/smoke/scoreboard.md").write_text("# Scoreboard")'
+    write_notebook(project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, text, WRITE)
     assert smoke(project, "--only", "09") == 0
+    report = (project / "outputs" / "smoke" / "report" / "index.html").read_text()
+    assert 'href="09_scoreboard.html"' in report and "profile smoke" in report
     assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: 2 reproduced, 1 not run"
 
 

@@ -1,0 +1,148 @@
+"""The outputs of a profile as web pages that need no network: `python -m lt_lib.report.html --outputs outputs/full`.
+
+<outputs>/report/index.html has the scoreboard, the figures and a link to every executed notebook, one page each.
+Every page holds its pictures, so that the folder can be copied anywhere.
+"""
+
+import argparse
+import base64
+import html
+import json
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from nbconvert import HTMLExporter
+from nbconvert.filters import markdown2html
+from traitlets.config import Config
+
+from lt_lib.files import writable_folder, write_atomically
+from lt_lib.params import ROOT, UserError
+from lt_lib.report.scoreboard import MARKS, told
+
+# What nbconvert would load from the network goes: no notebook here has widgets, diagrams or LaTeX.
+PAGE = """
+{%- extends 'lab/index.html.j2' -%}
+{%- macro picture(kind, output, resources) -%}
+<div class="jp-RenderedImage jp-OutputArea-output">
+<img src="data:{{ kind }};base64,{{ output.data[kind] | escape_html }}"
+     alt="a figure of {{ resources.metadata.name | escape_html }}"/>
+</div>
+{%- endmacro -%}
+{%- block html_head_js -%}{%- endblock -%}
+{%- block html_head_js_mathjax -%}{%- endblock -%}
+{%- block html_head_js_mermaidjs -%}{%- endblock -%}
+{%- block body_header -%}{{ super() }}
+<p class="jp-RenderedHTMLCommon"><a href="index.html">scoreboard, figures and all notebooks</a></p>
+{%- endblock -%}
+{%- block data_png -%}{{ picture('image/png', output, resources) }}{%- endblock -%}
+{%- block data_other -%}{{ picture('image/gif', output, resources) }}{%- endblock -%}
+"""
+SHOWN_FIRST = ["text/html", "text/markdown", "image/gif", "image/png", "text/plain"]
+PICTURES = {".png": "image/png", ".gif": "image/gif"}
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto; padding: 0 1rem }
+table { border-collapse: collapse; margin: 1rem 0 } td, th { border-bottom: 1px solid #ddd; padding: .2rem .6rem }
+td, th { text-align: left; vertical-align: top } td.verdict { font-weight: bold; white-space: nowrap }
+.anchor-link { display: none } figure { margin: 2rem 0 } figure img { max-width: 100% } figcaption { color: #555 }
+"""
+
+
+def write_report(outputs: Path) -> Path:
+    """Writes the pages of an outputs folder; returns the index.
+
+    Raises UserError where there is no scoreboard yet, or the folder cannot be written.
+    """
+    board, manifest = outputs / "scoreboard.md", outputs / "manifest.json"
+    for needed in (board, manifest):
+        if not needed.is_file():
+            raise UserError(f"{needed} is missing; run_all.py makes it")
+    folder = outputs / "report"
+    writable_folder(folder)
+    notebooks = sorted((outputs / "notebooks").glob("*.ipynb"))
+    exporter = _exporter()
+    for path in notebooks:
+        page, _ = exporter.from_filename(str(path))
+        write_atomically(folder / f"{path.stem}.html", page.encode())
+    names = [path.stem for path in notebooks]
+    text = index(json.loads(manifest.read_text()), names, board.read_text(encoding="utf-8"), outputs / "figures")
+    write_atomically(folder / "index.html", text.encode())
+    return folder / "index.html"
+
+
+def _exporter() -> HTMLExporter:
+    priority = Config({"NbConvertBase": {"display_data_priority": SHOWN_FIRST}})
+    return HTMLExporter(config=priority, raw_template=PAGE, exclude_anchor_links=True)
+
+
+def index(manifest: Mapping[str, Any], names: Sequence[str], board: str, figures: Path) -> str:
+    """The first page, from run_all.py's manifest, the executed notebooks' names and scoreboard.md."""
+    title = f"Latent Telepathy, profile {html.escape(manifest['profile'])}"
+    pictures = "".join(_figure(path, names) for path in sorted(figures.glob("*")) if path.suffix in PICTURES)
+    return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style></head><body>
+<h1>{title}</h1>
+<h2>Notebooks</h2>
+{_listing(manifest["notebooks"], names)}
+{_scoreboard(board, names)}
+<h2>Figures</h2>
+{pictures}
+<h2>Made with</h2>
+<p>{html.escape(_told({**manifest["versions"], **manifest["machine"]}))}</p>
+</body></html>
+"""
+
+
+def _told(facts: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in facts.items())
+
+
+def _listing(entries: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
+    """How every notebook went, each linked to its page where it has one."""
+    rows = "".join(
+        f"<tr><td>{_linked(name, names)}</td><td>{entry['status']}</td><td>{entry['seconds']:,.0f} s</td></tr>"
+        for name, entry in sorted(entries.items())
+    )
+    return f"<table><tr><th>notebook</th><th>status</th><th>time</th></tr>{rows}</table>"
+
+
+def _linked(name: str, names: Sequence[str]) -> str:
+    return f'<a href="{name}.html">{name}</a>' if name in names else name
+
+
+def _scoreboard(board: str, names: Sequence[str]) -> str:
+    """scoreboard.md as HTML one heading lower, notebooks linked, verdicts in their colours."""
+    page = markdown2html(re.sub(r"^#", "##", board, flags=re.MULTILINE))
+    for name in names:
+        page = re.sub(rf"(<h3[^>]*>){name}", rf"\1{_linked(name, names)}", page)
+    for kind, mark in MARKS.items():
+        cell = f'<td class="verdict" style="color: {mark.colour}">{told(kind)}</td>'
+        page = page.replace(f"<td>{told(kind)}</td>", cell)
+    return page
+
+
+def _figure(path: Path, names: Sequence[str]) -> str:
+    """A picture with its name, linked to the notebook that has its number."""
+    source = f"data:{PICTURES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
+    maker = next((name for name in names if name[:2] == path.stem[:2]), "09_scoreboard")
+    return f"""<figure><img src="{source}" alt="{path.stem}">
+<figcaption>{path.stem}, from {_linked(maker, names)}</figcaption></figure>
+"""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command line; returns the exit status, 2 for a folder that holds no outputs."""
+    parser = argparse.ArgumentParser(prog="python -m lt_lib.report.html", description=__doc__.splitlines()[0])
+    parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "full", metavar="DIR")
+    try:
+        print(write_report(parser.parse_args(arguments).outputs))
+    except UserError as error:
+        print(f"report: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,200 @@
+"""The task as other people's learners meet it: their libraries' own checkers, and the arena stepped directly."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from lt_lib.comm.channel import LATENCY, deliver
+from lt_lib.comm.messages import CONTENT
+from lt_lib.comm.team import NAVIGATOR, SCOUT, TeamEnv
+from lt_lib.envs import gym
+from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena
+from lt_lib.envs.camera import FastCamera, colours
+from lt_lib.envs.gym import ArenaEnv, ArenaVectorEnv
+from lt_lib.envs.layout import load_layout
+from lt_lib.learners import episodes
+from lt_lib.params import UserError
+
+ID = "lt_lib.envs.gym:LatentTelepathy/Corridors-v0"
+ONE = np.ones(1, bool)
+
+
+@pytest.fixture(scope="module")
+def layout():
+    return load_layout("default")
+
+
+def drawn(layout, seed):
+    """The scene of the first episode after `reset(seed=seed)`: spawn, slab and scout of an arena of one."""
+    rng = np.random.default_rng(seed)
+    spawn, scout = layout.spawn.sample(1, rng), layout.scout.sample(1, rng)
+    return spawn, rng.integers(2, size=1), scout
+
+
+def towards(pose, target):
+    """The action that drives straight to a point (metres), whatever the heading."""
+    dx, dy = np.subtract(target, pose[:2])
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([cos * dx + sin * dy, cos * dy - sin * dx, 0.0], np.float32) / 0.05
+
+
+# --- the libraries' own checkers
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_the_navigator_s_environment_passes_gymnasium_s_checker_without_a_warning():
+    check_env(gymnasium.make(ID).unwrapped)
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_the_team_passes_pettingzoo_s_checkers_without_a_warning(monkeypatch):
+    monkeypatch.setattr(gym, "HORIZON", 40)  # so that the checker sees episodes end
+    parallel_api_test(TeamEnv(), num_cycles=50)
+    parallel_seed_test(TeamEnv, num_cycles=30)
+
+
+# --- one navigator
+
+
+def test_an_episode_is_the_arena_stepped_directly(layout):
+    env, arena, camera = ArenaEnv(), Arena(layout, 1), FastCamera(layout)
+    frame, info = env.reset(seed=5)
+    spawn, slab, scout = drawn(layout, 5)
+    arena.reset(ONE, spawn, slab, scout)
+    rng, entered = np.random.default_rng(0), NO_CORRIDOR
+    for action in rng.uniform(-0.5, 1, (60, 3)).astype(np.float32):
+        np.testing.assert_array_equal(frame, colours(camera.frames(arena.pose, slab, scout[:, :2]))[0])
+        assert info == {"slab": slab[0], "entered": entered, "contact": arena.contact[0]}
+        frame, reward, terminated, truncated, info = env.step(action)
+        arena.step(action[None])
+        entered = arena.corridor[0] if entered == NO_CORRIDOR else entered
+        assert (reward, terminated, truncated) == (-0.01 * arena.contact[0], False, False)
+
+
+def follow(env, slab, waypoints):
+    """Drives an episode with that slab past waypoints, then stands still; returns its length, return and last step."""
+    seed = next(seed for seed in range(20) if env.reset(seed=seed)[1]["slab"] == slab)
+    env.reset(seed=seed)
+    waypoints, total, pose = list(waypoints), 0.0, env.unwrapped._scenes.arena
+    for length in range(1, HORIZON + 2):
+        if waypoints and np.hypot(*(pose.pose[0, :2] - waypoints[0])) < 0.1:
+            waypoints.pop(0)
+        action = towards(pose.pose[0], waypoints[0]) if waypoints else np.zeros(3, np.float32)
+        _, reward, terminated, truncated, info = env.step(np.clip(action, -1, 1))
+        total += reward
+        if terminated or truncated:
+            return length, total, terminated, truncated, info
+    raise AssertionError("it never ends")
+
+
+RIGHT = [(-1.8, -1.25), (0.3, -1.25), (0.3, -0.4), (1.7, -0.4)]
+
+
+def test_it_ends_with_the_arrival_and_its_reward():
+    length, total, terminated, truncated, info = follow(ArenaEnv(), 0, [*RIGHT, (2.3, -1.0), (6.0, 0.0)])
+    assert (terminated, truncated, info["entered"]) == (True, False, 1)
+    assert length < HORIZON and total == gym.ARRIVAL_REWARD
+
+
+def test_a_step_in_contact_costs_and_an_episode_that_never_arrives_is_truncated_after_600():
+    length, total, terminated, truncated, info = follow(ArenaEnv(), 1, [*RIGHT[:3], (0.85, -0.4)])
+    assert (length, terminated, truncated) == (HORIZON, False, True)
+    assert info == {"slab": 1, "entered": 1, "contact": True}
+    assert -0.01 * HORIZON < total < -1
+
+
+def test_the_reward_is_the_one_the_route_head_learns_from():
+    assert (gym.ARRIVAL_REWARD, gym.CONTACT_REWARD) == (episodes.ARRIVAL_REWARD, episodes.CONTACT_REWARD)
+
+
+def test_it_is_seen_from_above_as_a_picture_and_not_without_being_asked():
+    env = gymnasium.make(ID, render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.dtype == np.uint8 and picture.ndim == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 5
+    assert ArenaEnv().render() is None
+
+
+def test_an_unknown_layout_is_one_clear_line():
+    with pytest.raises(UserError, match="^unknown layout 'mine'"):
+        gymnasium.make(ID, layout="mine")
+
+
+# --- many navigators
+
+
+def test_every_row_of_the_vector_environment_is_an_environment_of_its_own_seed(monkeypatch):
+    monkeypatch.setattr(gym, "HORIZON", 9)
+    many, alone = gymnasium.make_vec(ID, num_envs=3), [ArenaEnv() for _ in range(3)]
+    assert many.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    frames, _ = many.reset(seed=40)
+    firsts = [env.reset(seed=40 + i) for i, env in enumerate(alone)]
+    np.testing.assert_array_equal(frames, [frame for frame, _ in firsts])
+    ended = False
+    for action in np.random.default_rng(0).uniform(-1, 1, (25, 3, 3)).astype(np.float32):
+        told = many.step(action)
+        fresh = [(*env.reset()[:1], 0.0, False, False, {}) if ended else env.step(a) for env, a in zip(alone, action)]
+        for got, expected in zip(told[:4], zip(*fresh), strict=False):
+            np.testing.assert_array_equal(got, np.array(expected))
+        assert told[4]["slab"].tolist() == [env.unwrapped._scenes.info()["slab"] for env in alone]
+        ended = told[3].all()
+    assert many.observation_space.contains(told[0])
+
+
+def test_rows_end_at_times_of_their_own():
+    many = ArenaVectorEnv(num_envs=2)
+    many.reset(seed=1)
+    many._scenes._age[0] = HORIZON - 1
+    still = np.zeros((2, 3), np.float32)
+    assert many.step(still)[3].tolist() == [True, False]
+    assert many.step(still)[3].tolist() == [False, False]
+    assert many._scenes._age.tolist() == [0, 2]
+
+
+# --- the team
+
+
+def test_a_message_arrives_one_step_late_with_the_anchor_of_its_arrival(layout):
+    env, rng = TeamEnv(), np.random.default_rng(0)
+    observed, _ = env.reset(seed=3)
+    assert not observed[NAVIGATOR]["wire"].any()
+    arena = env._scenes.arena
+    for _ in range(5):
+        message, action = rng.normal(size=CONTENT).astype(np.float32), rng.uniform(-1, 1, 3).astype(np.float32)
+        before = observed[NAVIGATOR]["wire"].copy()
+        later = env.step({NAVIGATOR: action, SCOUT: message})[0]
+        np.testing.assert_array_equal(observed[NAVIGATOR]["wire"], before)  # what was handed out stays
+        sent = torch.from_numpy(message)[None]
+        wire = deliver(sent, arena.scout[:, :2], arena.pose[:, :2], layout.communication_radius)[0].numpy()
+        np.testing.assert_array_equal(later[NAVIGATOR]["wire"], wire)
+        np.testing.assert_array_equal(later[NAVIGATOR]["wire"][2:], message)
+        observed = later
+    assert LATENCY == 1  # which is what the loop above has seen
+
+
+def test_the_team_shares_scene_reward_and_end_with_the_lone_navigator(layout):
+    team, alone = TeamEnv(content=1), ArenaEnv()
+    observed, _ = team.reset(seed=7)
+    np.testing.assert_array_equal(observed[NAVIGATOR]["frame"], alone.reset(seed=7)[0])
+    _, slab, scout = drawn(layout, 7)
+    camera, silence = FastCamera(layout), np.zeros(1, np.float32)
+    for action in np.random.default_rng(1).uniform(-1, 1, (20, 3)).astype(np.float32):
+        observed, *told, infos = team.step({NAVIGATOR: action, SCOUT: silence})
+        frame, *expected, info = alone.step(action)
+        np.testing.assert_array_equal(observed[NAVIGATOR]["frame"], frame)
+        assert [list(each.values()) for each in told] == [[value] * 2 for value in expected]
+        assert infos == {NAVIGATOR: info, SCOUT: info}
+    other = team._scenes.arena.pose[:, :2]
+    np.testing.assert_array_equal(observed[SCOUT], colours(camera.frames(scout, slab, other))[0])
+
+
+def test_out_of_range_nothing_arrives(layout):
+    env = TeamEnv()
+    env.reset(seed=0)
+    env._scenes.arena.scout[:, 0] = 100.0
+    observed, *_ = env.step({NAVIGATOR: np.zeros(3, np.float32), SCOUT: np.ones(CONTENT, np.float32)})
+    assert not observed[NAVIGATOR]["wire"].any()
