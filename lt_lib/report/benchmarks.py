@@ -148,7 +148,8 @@ def growth(what: str, calls: Mapping[int, Callable[[], Any]], rounds: int) -> Gr
     sizes, spent = np.array(list(seconds)), np.array(list(seconds.values()))
     line = stats.linregress(np.log(sizes), np.log(spent))
     reach = line.stderr * stats.t.ppf(0.975, len(sizes) - 2)
-    return Growth(what, tuple(sizes), tuple(spent), line.slope, line.slope - reach, line.slope + reach)
+    slope = float(line.slope)
+    return Growth(what, tuple(sizes.tolist()), tuple(spent.tolist()), slope, slope - float(reach), slope + float(reach))
 
 
 def of_environments(
