@@ -34,6 +34,7 @@ NEEDS = {
     "04_pixels": ("02_encoder",),
     "05_coverage_sweep": ("02_encoder",),
     "07_corruption": ("03_gridworld", "04_pixels"),
+    "10_speed": ("03_gridworld", "04_pixels"),
 }
 # What this script gives to every notebook, over what the profile says.
 GIVEN = ("profile", "outputs", "workers")

@@ -444,6 +444,23 @@ class RolloutConfig(Training):
     precision: Precision = "float32"
 
 
+Sizes = Annotated[list[PositiveInt], Field(min_length=3)]  # that a slope is fitted through
+
+
+class Stretch(Settings):
+    """How much of the real work notebook 10 times, and at which sizes."""
+
+    rounds: PositiveInt  # in which all sides take turns
+    scenes: PositiveInt  # draws of the scene behind either precision
+    live: PositiveInt  # episodes
+    singles: PositiveInt  # runs of a stack timed one by one
+    runs: PositiveInt  # shared among workers
+    updates: Budget  # of the point-mass study
+    environments: Sizes
+    seeds: Sizes
+    episodes: Sizes
+
+
 # How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
 SECTIONS: dict[str, Any] = {
     "encoder": EncoderConfig,
@@ -470,6 +487,7 @@ SECTIONS: dict[str, Any] = {
     "sigmas": Annotated[list[PositiveFloat], Field(min_length=1)],
     "taus": Annotated[list[NonNegativeFloat], Field(min_length=1)],
     "draws": PositiveInt,
+    "stretch": Stretch,
     "seeds": dict[str, PositiveInt],
     "shards": PositiveInt,
     "more_seeds": PositiveInt,

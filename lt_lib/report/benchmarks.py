@@ -1,0 +1,230 @@
+"""What the fast paths buy and how costs grow: small stretches of the real work, timed side by side (notebook 10)."""
+
+import cProfile
+import pstats
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from scipy import stats
+
+from lt_lib.comm.channel import ANCHOR, deliver
+from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
+from lt_lib.comm.route_head import RouteHead
+from lt_lib.envs.arena import Arena
+from lt_lib.envs.camera import FastCamera
+from lt_lib.envs.layout import Layout
+from lt_lib.learners.episodes import SLABS, Draws, draw_scenes, roll_bank
+from lt_lib.learners.executor import FrozenExecutor
+from lt_lib.learners.protocol import Protocol
+from lt_lib.learners.redraw import train_redrawn_head
+from lt_lib.learners.route import train_head
+from lt_lib.learners.score_function import train_point_mass
+from lt_lib.params import PointMassConfig
+from lt_lib.perception.encoder import FrozenEncoder
+from lt_lib.report.style import ROLES
+from lt_lib.runs import Result, Run, RunStore
+from lt_lib.timing import taking_turns
+
+PRECISIONS = ("float32", "bfloat16")
+
+
+def _unheard(_: float) -> None:
+    """A run's progress, which nobody watches here."""
+
+
+# --- precision
+def precision(layout: Layout, encoder: Result, head: Result, scenes: int, rounds: int) -> pd.DataFrame:
+    """Either precision of the frozen encoder: its cost, and what it changes in latents and in a frozen head's choices.
+
+    The frames are what the scout sees in so many draws of the scene under both placements; choices are greedy.
+    """
+    draws = draw_scenes(layout, scenes, np.random.default_rng(0))
+    draws, slab = Draws(*(np.repeat(values, SLABS, axis=0) for values in draws)), np.tile(np.arange(SLABS), scenes)
+    frames = FastCamera(layout).frames(draws.scout, slab, draws.spawn[:, :2])
+    frozen = {name: FrozenEncoder(encoder, precision=name) for name in PRECISIONS}
+    seconds = taking_turns({name: lambda each=each: each.latent(frames) for name, each in frozen.items()}, rounds)
+    latents = {name: each.latent(frames) for name, each in frozen.items()}
+    choices = {name: _choices(layout, each, head, draws, slab, frames) for name, each in frozen.items()}
+    reference = PRECISIONS[0]
+    rows = {
+        name: {
+            "microseconds a frame": seconds[name] / len(frames) * 1e6,
+            "times as fast": seconds[reference] / seconds[name],
+            "largest change of a latent (sd)": (latents[name] - latents[reference]).abs().max().item(),
+            "mean change (sd)": (latents[name] - latents[reference]).abs().mean().item(),
+            "same route chosen": (choices[name] == choices[reference]).float().mean().item(),
+            "route optimality": (choices[name].numpy() == 1 - slab).mean(),
+        }
+        for name in PRECISIONS
+    }
+    return pd.DataFrame(rows).T
+
+
+@torch.no_grad()
+def _choices(layout: Layout, frozen: FrozenEncoder, result: Result, draws: Draws, slab, frames) -> torch.Tensor:
+    head = RouteHead(ANCHOR + CONTENT)
+    head.load_state_dict({k.removeprefix("head."): torch.tensor(v) for k, v in result.items() if k[:5] == "head."})
+    still = np.zeros((len(frames), 2))
+    sent = CONTENTS["latent"](Sender(layout, frozen, frames, draws.scout, still, slab))
+    wire = deliver(sent, draws.scout[:, :2], draws.spawn[:, :2], layout.communication_radius)
+    return head.policy(wire).probs.argmax(1)
+
+
+# --- the episode bank
+class BankCost(NamedTuple):
+    """Processor seconds."""
+
+    bank: float  # of the whole bank, every outcome of every draw
+    head: float  # of training one head on it
+    live: float  # of training one head in the live simulation, one draw an episode
+
+    def heads(self, count: int) -> tuple[float, float]:
+        """So many heads by the bank, and live."""
+        return self.bank + count * self.head, count * self.live
+
+
+def bank_against_live(protocol: Protocol, bank: Result, encoder: Result, executor: Result, episodes: int) -> BankCost:
+    """What a head costs either way, from stretches of `episodes` episodes scaled to the protocol's own numbers."""
+    entries = max(episodes // bank["success"][0].size, 1)
+    frozen = {"encoder": encoder, "executor": executor}
+    scenes = {name: bank[name] for name in ("spawn", "scout")}
+    rolled = protocol.bank.model_copy(update={"entries": entries})
+    once = protocol.redraw.model_copy(
+        update={
+            "every": 0,
+            "content": "latent",
+            "credit": "episode",
+            "episodes": episodes,
+            "precision": rolled.precision,
+        }
+    )
+    calls = {
+        "bank": lambda: roll_bank(rolled, 0, report=_unheard, **frozen),
+        "head": lambda: train_head(protocol.head, 0, report=_unheard, bank=bank, encoder=encoder),
+        "live": lambda: train_redrawn_head(once, 0, report=_unheard, scenes=scenes, **frozen),
+    }
+    seconds = taking_turns(calls, 1)
+    return BankCost(
+        seconds["bank"] * protocol.bank.entries * protocol.shards / entries,
+        seconds["head"],
+        seconds["live"] * protocol.head.episodes / episodes,
+    )
+
+
+# --- workers
+def fan_out(config: PointMassConfig, runs: int, workers: Sequence[int]) -> dict[int, float]:
+    """Wall-clock seconds of the same runs from nothing, by the number of workers, their start included."""
+
+    def fetch(count: int) -> None:
+        with TemporaryDirectory() as folder:
+            store = RunStore(Path(folder), count)
+            store.fetch([Run(train_point_mass, config, seed * config.seeds) for seed in range(runs)], "timed runs")
+
+    return taking_turns({count: lambda count=count: fetch(count) for count in workers}, 1, time.perf_counter)
+
+
+# --- growth
+class Growth(NamedTuple):
+    """Seconds at increasing sizes, and the exponent of the power law through them with its 95% interval."""
+
+    what: str
+    sizes: tuple[int, ...]
+    seconds: tuple[float, ...]
+    slope: float
+    low: float
+    high: float
+
+
+def growth(what: str, calls: Mapping[int, Callable[[], Any]], rounds: int) -> Growth:
+    """Times the calls, one a size, and fits a line to the logarithms."""
+    seconds = taking_turns(calls, rounds)
+    sizes, spent = np.array(list(seconds)), np.array(list(seconds.values()))
+    line = stats.linregress(np.log(sizes), np.log(spent))
+    reach = line.stderr * stats.t.ppf(0.975, len(sizes) - 2)
+    slope = float(line.slope)
+    return Growth(what, tuple(sizes.tolist()), tuple(spent.tolist()), slope, slope - float(reach), slope + float(reach))
+
+
+def of_environments(
+    layout: Layout, encoder: Result, executor: Result, precision: str, sizes: Sequence[int]
+) -> dict[int, Callable[[], None]]:
+    """One control step of so many scenes side by side: picture, latent, velocity, physics."""
+    frozen, driver, camera = FrozenEncoder(encoder, precision=precision), FrozenExecutor(executor), FastCamera(layout)
+
+    def stepper(n: int) -> Callable[[], None]:
+        arena, rng = Arena(layout, n), np.random.default_rng(0)
+        draws, slab, route = draw_scenes(layout, n, rng), rng.integers(0, SLABS, n), rng.integers(0, SLABS, n)
+        arena.reset(np.ones(n, bool), draws.spawn, slab, draws.scout)
+
+        def step() -> None:
+            latent = frozen.latent(camera.frames(arena.pose, arena.slab, arena.scout[:, :2]))
+            arena.step(driver.mean_action(latent, route))
+
+        return step
+
+    return {n: stepper(n) for n in sizes}
+
+
+def of_seeds(config: PointMassConfig, sizes: Sequence[int]) -> dict[int, Callable[[], dict]]:
+    """The point-mass study with so many seeds a setting in one stack."""
+    configs = {n: config.model_copy(update={"seeds": n}) for n in sizes}
+    return {n: lambda each=each: train_point_mass(each, 0, report=_unheard) for n, each in configs.items()}
+
+
+def of_episodes(
+    protocol: Protocol, bank: Result, encoder: Result, sizes: Sequence[int]
+) -> dict[int, Callable[[], dict]]:
+    """A route head trained on the bank for so many episodes."""
+    configs = {n: protocol.head.model_copy(update={"episodes": n}) for n in sizes}
+    inputs = {"bank": bank, "encoder": encoder}
+    return {n: lambda each=each: train_head(each, 0, report=_unheard, **inputs) for n, each in configs.items()}
+
+
+def growth_figure(growths: Sequence[Growth]) -> Figure:
+    """Seconds against size, both logarithmic, a panel a cost; dotted: proportional growth."""
+    figure = Figure(figsize=(4.4 * len(growths), 3.8), layout="constrained")
+    for axes, each in zip(figure.subplots(1, len(growths), squeeze=False)[0], growths, strict=True):
+        sizes, seconds = np.array(each.sizes), np.array(each.seconds)
+        axes.loglog(sizes, seconds, "o-", color=ROLES["ours"])
+        axes.loglog(sizes, seconds[-1] * sizes / sizes[-1], ":", color="black", lw=1)
+        axes.set_title(f"{each.what}\nslope {each.slope:.2f} [{each.low:.2f}, {each.high:.2f}]", fontsize=10)
+        axes.set(xlabel=each.what.split(" ")[0], ylabel="processor time (s)")
+    return figure
+
+
+# --- where the time goes
+def stages(manifest: Mapping[str, Any]) -> pd.DataFrame:
+    """Seconds a notebook of a manifest, and its share of them all, largest first."""
+    seconds = pd.Series({name: entry["seconds"] for name, entry in manifest["notebooks"].items()}, name="seconds")
+    table = seconds.sort_values(ascending=False).to_frame()
+    return table.assign(share=table.seconds / table.seconds.sum())
+
+
+def profile(call: Callable[[], Any], most: int) -> pd.DataFrame:
+    """The functions that a call spends most of its time in, not counting what they call: seconds and share."""
+    profiler = cProfile.Profile()
+    profiler.runcall(call)
+    table = {
+        f"{Path(file).name}:{name}" if "~" not in file else name: {"seconds": own, "calls": calls}
+        for (file, _, name), (_, calls, own, _, _) in pstats.Stats(profiler).stats.items()
+    }
+    table = pd.DataFrame(table).T.sort_values("seconds", ascending=False)
+    return table.assign(share=table.seconds / table.seconds.sum()).head(most)
+
+
+def live_training(
+    protocol: Protocol, bank: Result, encoder: Result, executor: Result, episodes: int
+) -> Callable[[], dict]:
+    """A stretch of live training with a draw at every step, to be profiled."""
+    config = protocol.redraw.model_copy(
+        update={"every": 1, "content": "latent", "credit": "episode", "episodes": episodes}
+    )
+    scenes = {name: bank[name] for name in ("spawn", "scout")}
+    return lambda: train_redrawn_head(config, 0, report=_unheard, scenes=scenes, encoder=encoder, executor=executor)

@@ -1,0 +1,51 @@
+"""What notebook 10 measures with: turns, growth, profiles."""
+
+import time
+
+import numpy as np
+import pytest
+
+from lt_lib.report import benchmarks
+from lt_lib.timing import taking_turns
+
+
+def test_turns_alternate_and_the_first_round_is_not_counted():
+    heard = []
+    spent = iter([100.0, 0.0, 1.0, 10.0, 2.0, 20.0, 3.0, 30.0])
+    now = [0.0]
+
+    def call(name):
+        heard.append(name)
+        now[0] += next(spent)
+
+    seconds = taking_turns({name: lambda name=name: call(name) for name in "ab"}, 3, lambda: now[0])
+    assert heard == list("abababab")
+    assert seconds == {"a": 2.0, "b": 20.0}
+
+
+def test_growth_finds_the_exponent_of_a_power_law(monkeypatch):
+    monkeypatch.setattr(benchmarks, "taking_turns", lambda calls, rounds: {n: 3e-4 * n**1.5 for n in calls})
+    found = benchmarks.growth("things", dict.fromkeys((1, 4, 16, 64)), 1)
+    assert found.slope == pytest.approx(1.5) and found.low <= found.slope <= found.high
+    noisy = {1: 1.0, 4: 5.0, 16: 14.0, 64: 70.0}
+    monkeypatch.setattr(benchmarks, "taking_turns", lambda calls, rounds: noisy)
+    found = benchmarks.growth("things", noisy, 1)
+    slope, _ = np.polyfit(np.log(list(noisy)), np.log(list(noisy.values())), 1)
+    assert found.slope == pytest.approx(slope) and found.high - found.low > 0.05
+
+
+def _busy():
+    end = time.process_time() + 0.05
+    while time.process_time() < end:
+        pass
+
+
+def test_a_profile_names_the_function_that_takes_the_time_first():
+    table = benchmarks.profile(_busy, 3)
+    assert len(table) <= 3 and "process_time" in " ".join(table.index[:2]) + "_busy" and table.share.iloc[0] > 0.3
+    assert any(name.endswith(":_busy") for name in table.index)
+
+
+def test_the_bank_pays_after_its_own_price():
+    price = benchmarks.BankCost(bank=100.0, head=1.0, live=60.0)
+    assert price.heads(1) == (101.0, 60.0) and price.heads(10) == (110.0, 600.0)
