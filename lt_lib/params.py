@@ -444,7 +444,7 @@ class RolloutConfig(Training):
     precision: Precision = "float32"
 
 
-Sizes = Annotated[list[PositiveInt], Field(min_length=3)]  # that a slope is fitted through
+Sizes = Annotated[tuple[PositiveInt, ...], Field(min_length=3)]  # that a slope is fitted through
 
 
 class Stretch(Settings):
