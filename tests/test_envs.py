@@ -149,9 +149,12 @@ def test_rows_end_at_times_of_their_own():
     many = ArenaVectorEnv(num_envs=2)
     many.reset(seed=1)
     many._scenes._age[0] = HORIZON - 1
+    many._scenes.entered[:] = 1
     still = np.zeros((2, 3), np.float32)
     assert many.step(still)[3].tolist() == [True, False]
-    assert many.step(still)[3].tolist() == [False, False]
+    *_, truncated, infos = many.step(still)
+    assert truncated.tolist() == [False, False]
+    assert infos["entered"].tolist() == [NO_CORRIDOR, 1]
     assert many._scenes._age.tolist() == [0, 2]
 
 
@@ -174,6 +177,7 @@ def test_a_message_arrives_one_step_late_with_the_anchor_of_its_arrival(layout):
         np.testing.assert_array_equal(later[NAVIGATOR]["wire"][2:], message)
         observed = later
     assert LATENCY == 1  # which is what the loop above has seen
+    assert not env.reset()[0][NAVIGATOR]["wire"].any()
 
 
 def test_the_team_shares_scene_reward_and_end_with_the_lone_navigator(layout):
@@ -190,6 +194,11 @@ def test_the_team_shares_scene_reward_and_end_with_the_lone_navigator(layout):
         assert infos == {NAVIGATOR: info, SCOUT: info}
     other = team._scenes.arena.pose[:, :2]
     np.testing.assert_array_equal(observed[SCOUT], colours(camera.frames(scout, slab, other))[0])
+    beside_the_goal = np.array([[layout.goal.x - layout.goal.radius - 0.02, layout.goal.y, 0.0]])
+    team._scenes.arena.reset(ONE, beside_the_goal, slab, scout)
+    _, rewards, terminated, _, _ = team.step({NAVIGATOR: np.array([1, 0, 0], np.float32), SCOUT: silence})
+    assert rewards == {NAVIGATOR: 1, SCOUT: 1} and terminated == {NAVIGATOR: True, SCOUT: True}
+    assert team.agents == []
 
 
 def test_out_of_range_nothing_arrives(layout):

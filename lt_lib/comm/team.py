@@ -85,7 +85,7 @@ class TeamEnv(ParallelEnv):
         return deliver(sent, arena.scout[:, :2], arena.pose[:, :2], radius)[0].numpy()
 
     def _observe(self) -> dict[str, Any]:
-        navigator = {"frame": self._scenes.navigator_frames()[0], "wire": self._wire.copy()}
+        navigator = {"frame": self._scenes.navigator_frames()[0], "wire": self._wire}
         return {NAVIGATOR: navigator, SCOUT: self._scenes.scout_frames()[0]}
 
     def _each(self, value: Any) -> dict[str, Any]:
