@@ -25,6 +25,7 @@ from lt_lib.params import ROOT, Settings, UserError, explain
 Notebook = Literal[
     "01_occlusion_check", "02_encoder", "03_gridworld", "04_pixels", "05_coverage_sweep",
     "06_z_study", "07_corruption", "08_hardware_decode", "09_scoreboard",
+    "10_speed",
 ]  # fmt: skip
 Number = int | float
 Numbers = Number | tuple[Number, ...]
