@@ -19,12 +19,12 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
 from lt_lib.files import claimed, writable_folder
-from lt_lib.manifest import write_manifest
+from lt_lib.manifest import stages_since, write_manifest
 from lt_lib.params import ROOT, UserError, load_profile, notebook_defaults, notebook_names
 from lt_lib.preflight import check_cluster, check_inputs, settled
 from lt_lib.progress import Progress, read_progress
@@ -61,11 +61,12 @@ class Plan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a notebook went: 'ok', 'FAILED' or 'skipped', seconds, and the reason in one line."""
+    """How a notebook went: 'ok', 'FAILED' or 'skipped', seconds, the reason in one line, what was computed for it."""
 
     status: str
     seconds: float
     reason: str = ""
+    stages: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 class Parser(argparse.ArgumentParser):
@@ -179,8 +180,8 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
         outcomes[name] = Outcome("skipped", 0.0, f"needs {failed[0]}") if failed else execute(plan, name)
         outcome = outcomes[name]
         print(f"{name:20}{outcome.status:8}{clock(outcome.seconds):>8}  {outcome.reason}".rstrip(), flush=True)
-    entries = {name: {"status": each.status, "seconds": round(each.seconds, 1)} for name, each in outcomes.items()}
-    write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, entries)
+        entry = {"status": outcome.status, "seconds": round(outcome.seconds, 1), "stages": outcome.stages}
+        write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, {name: entry})
     if "09_scoreboard" in outcomes and outcomes["09_scoreboard"].status == "ok":
         from lt_lib.report.html import write_report  # takes seconds, which bad input need not wait for
 
@@ -194,7 +195,8 @@ def execute(plan: Plan, name: str) -> Outcome:
     log = plan.outputs / "logs" / f"{name}.log"
     results = plan.outputs / "results" / f"{name}.json"
     before = results.stat().st_mtime_ns if results.exists() else None
-    started = time.time()
+    journal = plan.root / "outputs" / "runs" / "journal.jsonl"
+    started, computed = time.time(), journal.stat().st_size if journal.exists() else 0
     with log.open("w", encoding="utf-8") as file, live_line(name, plan.root / "outputs" / "runs"):
         reason = edited(plan, name) or run_papermill(plan, name, file)
     if not reason and (not results.exists() or results.stat().st_mtime_ns == before):
@@ -202,7 +204,7 @@ def execute(plan: Plan, name: str) -> Outcome:
     reason = reason or edited(plan, name)
     if reason:
         reason = f"{reason} (log: {shown(log, plan.root)})"
-    return Outcome("FAILED" if reason else "ok", time.time() - started, reason)
+    return Outcome("FAILED" if reason else "ok", time.time() - started, reason, stages_since(journal, computed))
 
 
 def edited(plan: Plan, name: str) -> str:

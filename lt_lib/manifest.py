@@ -1,4 +1,4 @@
-"""What an outputs folder was made with: library versions, commit, machine, and seconds a notebook."""
+"""What an outputs folder was made with: library versions, commit, machine, seconds a notebook and a stage."""
 
 import json
 import logging
@@ -19,7 +19,7 @@ from lt_lib.files import write_atomically
 def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str, Mapping[str, Any]]) -> None:
     """Writes the manifest; what an earlier one says of notebooks that did not run this time stays.
 
-    notebooks: {name: {"status": text, "seconds": float}} of this time.
+    notebooks: {name: {"status": text, "seconds": float, "stages": as of `stages_since`}} of this time.
     """
     earlier = _notebooks_in(path)
     commit = git_state(root)
@@ -42,6 +42,18 @@ def _notebooks_in(path: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError):
         logging.getLogger(__name__).warning("%s is damaged: it is written anew", path)
         return {}
+
+
+def stages_since(journal: Path, position: int) -> dict[str, dict[str, int | float]]:
+    """Runs computed since the journal had so many bytes: {function: {"runs": count, "seconds": of the workers}}."""
+    stages: dict[str, dict[str, int | float]] = {}
+    if journal.exists():
+        for line in journal.read_bytes()[position:].splitlines():
+            entry = json.loads(line)
+            stage = stages.setdefault(entry["function"], {"runs": 0, "seconds": 0.0})
+            stage["runs"] += 1
+            stage["seconds"] = round(stage["seconds"] + entry["seconds"], 1)
+    return stages
 
 
 def versions(requirements: Path) -> dict[str, str]:

@@ -13,6 +13,7 @@ from toy_project import COMPUTE, LIMIT_S, RAISE, WRITE, journal, losses, smoke, 
 from toy_runs import ToyConfig, train_toy
 
 from lt_lib import params
+from lt_lib.manifest import stages_since
 from lt_lib.params import UserError, explain, load_profile
 from lt_lib.progress import Progress
 from run_all import choose, clock, describe, main
@@ -211,6 +212,7 @@ def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd)
         assert str(project) not in (outputs / "notebooks" / f"{name}.ipynb").read_text()
         assert manifest["notebooks"][name]["status"] == "ok"
         assert manifest["notebooks"][name]["seconds"] > 0
+        assert manifest["notebooks"][name]["stages"]["train_toy"]["runs"] == 2
     assert manifest["profile"] == "smoke"
     assert set(manifest["versions"]) == {"python", "numpy"}
     assert manifest["machine"]["cores"] >= 1
@@ -309,3 +311,15 @@ def test_interrupted_it_says_so_and_leaves_nothing_running(project):
     assert process.returncode == 130
     (line,) = process.stderr.read().splitlines()
     assert line.startswith("run_all: interrupted; finished runs are kept")
+
+
+def test_stages_are_the_runs_that_the_journal_gained(tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    assert stages_since(journal, 0) == {}
+    spent = (("train", 1.2), ("roll", 2.0), ("train", 3.0))
+    lines = [{"function": name, "seconds": seconds} for name, seconds in spent]
+    journal.write_text("".join(json.dumps(line) + "\n" for line in lines[:1]))
+    before = journal.stat().st_size
+    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert stages_since(journal, before) == {"roll": {"runs": 1, "seconds": 2.0}, "train": {"runs": 1, "seconds": 3.0}}
+    assert stages_since(journal, 0)["train"] == {"runs": 2, "seconds": 4.2}

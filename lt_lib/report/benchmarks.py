@@ -1,6 +1,7 @@
 """What the fast paths buy and how costs grow: small stretches of the real work, timed side by side (notebook 10)."""
 
 import cProfile
+import json
 import pstats
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -200,11 +201,14 @@ def growth_figure(growths: Sequence[Growth]) -> Figure:
 
 
 # --- where the time goes
-def stages(manifest: Mapping[str, Any]) -> pd.DataFrame:
-    """Seconds a notebook of a manifest, and its share of them all, largest first."""
-    seconds = pd.Series({name: entry["seconds"] for name, entry in manifest["notebooks"].items()}, name="seconds")
-    table = seconds.sort_values(ascending=False).to_frame()
-    return table.assign(share=table.seconds / table.seconds.sum())
+def stages(manifest: Path) -> pd.DataFrame:
+    """Worker seconds of every stage that a manifest tells of, by notebook, and its share of them all; largest first."""
+    notebooks = json.loads(manifest.read_text(encoding="utf-8"))["notebooks"] if manifest.exists() else {}
+    rows = {
+        (name, stage): spent for name, entry in notebooks.items() for stage, spent in entry.get("stages", {}).items()
+    }
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=["runs", "seconds"])
+    return table.assign(share=table.seconds / table.seconds.sum()).sort_values("seconds", ascending=False)
 
 
 def profile(call: Callable[[], Any], most: int) -> pd.DataFrame:
