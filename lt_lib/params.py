@@ -532,7 +532,7 @@ class HardwareGates(Settings):
 
     candidates: Annotated[dict[str, dict[Literal["colour", "texture"], Share]], Field(min_length=1)]
     hazard: Share
-    walls: Annotated[float, Field(le=1)]
+    walls: Annotated[float, Field(le=1)]  # R^2
     rank: NonNegativeFloat
     decode: Share
     red_ratio: PositiveFloat

@@ -30,7 +30,7 @@ class Shot(NamedTuple):
 
 def rendered_size() -> tuple[int, int]:
     """Width and height in pixels of the picture that `expose` takes."""
-    return tuple(int(round(MARGIN * OVERSAMPLING * side / 2)) * 2 for side in (WIDTH, HEIGHT))
+    return tuple(round(MARGIN * OVERSAMPLING * side / 2) * 2 for side in (WIDTH, HEIGHT))
 
 
 def draw_shot(optics: OpticsConfig, rng: np.random.Generator) -> Shot:
