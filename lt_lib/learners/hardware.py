@@ -98,15 +98,21 @@ class HardwareProtocol:
         bench = self.sessions.live.model_copy(update={"hazard": self.simulated, "clear": self.simulated})
         return simulated_session(bench, self.config(name), SIMULATED + 100 * part)
 
-    def filmed(self) -> dict[str, Session]:
-        """The three sessions with the camera: the surrogate's, or those of the folder of real frames."""
-        if self.folder:
-            return read_sessions(self.folder)
+    def surrogate(self) -> dict[str, Session]:
+        """The three sessions with the surrogate camera."""
         return {name: session_of(result) for name, result in self._films().items()}
+
+    def filmed(self) -> dict[str, Session]:
+        """The three sessions to decode: those of the folder of real frames, else the surrogate's."""
+        return read_sessions(self.folder) if self.folder else self.surrogate()
 
     def views(self) -> dict[str, np.ndarray]:
         """Some whole frames of each of the surrogate's sessions."""
         return {name: result["views"] for name, result in self._films().items()}
+
+    def _films(self) -> dict[str, Result]:
+        runs = [Run(film_session, getattr(self.sessions, name), seed) for name, seed in FILMED.items()]
+        return dict(zip(FILMED, self.store.fetch(runs, "surrogate sessions"), strict=True))
 
     def transfers(
         self, encoders: Mapping[str, Result], looks: str, sessions: Mapping[str, Session]
@@ -118,15 +124,16 @@ class HardwareProtocol:
             for name, encoder in encoders.items()
         }
 
-    def _films(self) -> dict[str, Result]:
-        runs = [Run(film_session, getattr(self.sessions, name), seed) for name, seed in FILMED.items()]
-        return dict(zip(FILMED, self.store.fetch(runs, "surrogate sessions"), strict=True))
-
     def sweeps(self, effects: Sequence[str], sizes: Mapping[str, int]) -> dict[str, Result]:
         """The surrogate's frames at rising strengths of each effect; see `perception.sessions.film_sweep`."""
         live = self.sessions.live.model_dump(exclude={"hazard", "clear", "shots", "frames", "layout_digest"})
         runs = [Run(film_sweep, SweepConfig(**live | dict(sizes), effect=effect), SWEPT) for effect in effects]
         return dict(zip(effects, self.store.fetch(runs, "camera effects"), strict=True))
+
+    def ordinary(self, effects: Sequence[str]) -> dict[str, float]:
+        """The strength of each effect in the live session."""
+        live = self.sessions.live
+        return {effect: float((live.optics.model_dump() | live.bench.model_dump())[effect]) for effect in effects}
 
     def rails_of(self, encoder: Result) -> Result:
         """How bang-bang the executor is that was pretrained behind an encoder at matched optics."""

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.linalg import sqrtm
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import balanced_accuracy_score, roc_auc_score
 
@@ -89,5 +88,7 @@ def frechet(one: Float[np.ndarray, "n d"], other: Float[np.ndarray, "m d"]) -> f
     """
     gap = one.mean(0) - other.mean(0)
     a, b = np.cov(one, rowvar=False), np.cov(other, rowvar=False)
-    root = np.real(sqrtm(a @ b))
-    return float(gap @ gap + np.trace(a + b - 2 * root))
+    values, vectors = np.linalg.eigh(a)
+    half = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T  # the square root of a
+    cross = np.sqrt(np.maximum(np.linalg.eigvalsh(half @ b @ half), 0)).sum()  # the trace of (a b)^(1/2)
+    return float(gap @ gap + np.trace(a) + np.trace(b) - 2 * cross)

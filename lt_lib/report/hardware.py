@@ -8,10 +8,12 @@ import pandas as pd
 from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
+from lt_lib.perception.matched import PictureEncoder
 from lt_lib.perception.probe import Transfer, decoded, frechet, placements_right, red_shares
 from lt_lib.perception.sessions import EFFECTS, Session
 from lt_lib.report import stats
 from lt_lib.report.style import ROLES, chance_line
+from lt_lib.runs import Result
 
 HAZARD, CLEAR = "#B22222", ROLES["ours"]
 CAMERA = ("refit", "validation", "live")
@@ -157,6 +159,28 @@ def what_breaks(
     panels[0].legend(fontsize=7, loc="lower left", bbox_to_anchor=(0.0, 0.1))
     figure.supylabel("balanced accuracy of the refit probe")
     return figure
+
+
+def under_effect(transfer: Transfer, encoder: Result, sweep: Result) -> Float[np.ndarray, " s"]:
+    """Balanced accuracy of the refit probe at each strength of one effect."""
+    network = PictureEncoder(encoder)
+    return np.array(
+        [decoded(transfer.refit.scores(network.latents(each)), sweep["hazard"]).balanced for each in sweep["frames"]]
+    )
+
+
+def break_table(
+    pair: Mapping[str, Mapping[str, Float[np.ndarray, " s"]]], many: Mapping[str, Float[np.ndarray, "n s"]], gate: float
+) -> pd.DataFrame:
+    """Balanced accuracy at the greatest strength of each effect, an effect a row."""
+    rows = {}
+    for effect, encoders in pair.items():
+        worst = {name: f"{values[-1]:.2f}" for name, values in encoders.items()}
+        seeds = many[effect][:, -1]
+        worst |= {"encoder seeds, mean": f"{seeds.mean():.2f}", "worst seed": f"{seeds.min():.2f}"}
+        greatest = f"{EFFECTS[effect].unit}: {EFFECTS[effect].strengths[-1]:g}"
+        rows[greatest] = worst | {f"seeds at {gate} or above": f"{(seeds >= gate).sum()} of {len(seeds)}"}
+    return pd.DataFrame(rows).T
 
 
 def live_table(session: Session, right: np.ndarray) -> pd.DataFrame:
