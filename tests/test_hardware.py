@@ -542,7 +542,7 @@ def shoot(folder: Path, video: str, **changes) -> int:
 def test_a_video_becomes_a_folder_that_the_notebook_reads(video, tmp_path, capsys):
     for placement, (session, hazard) in enumerate([(s, h) for s in FILMED for h in (0, 1)]):
         assert shoot(tmp_path, video, session=session, placement=placement, hazard=hazard, skip=1 + 2 * placement) == 0
-    assert "2 frames: refit_000_a.png, refit_000_b.png" in capsys.readouterr().out
+    assert "2 frames: refit_000_1.png, refit_000_2.png" in capsys.readouterr().out
     sessions = read_sessions(tmp_path)
     assert sessions["live"].placement.tolist() == [4, 4, 5, 5]
     assert sessions["live"].hazard.tolist() == [False, False, True, True]
@@ -554,6 +554,8 @@ def test_a_video_becomes_a_folder_that_the_notebook_reads(video, tmp_path, capsy
     ("changes", "line"),
     [
         ({"source": "nothing.avi"}, "--source nothing.avi: no camera and no video that OpenCV can open"),
+        ({"shots": 0}, "--shots must be 1 or more, got 0"),
+        ({"distance": "nan"}, "--distance must be 0 or more, got nan"),
         ({"skip": 30}, "ended after 1 of 2 shots; take fewer, or skip fewer"),
         ({"crop": 130}, "--crop 130 must lie between 64 and the frame's 120 pixels"),
         ({"crop": 90, "placement": 2}, "--crop 90: "),

@@ -46,7 +46,7 @@ def test_every_notebook_leaves_results_figures_and_an_executed_copy(undisturbed)
         assert all(cell["outputs"] is not None for cell in executed["cells"] if cell["cell_type"] == "code")
         assert str(ROOT) not in json.dumps([cell.get("outputs") for cell in executed["cells"]])
     figures = {path.name for path in (undisturbed / "figures").iterdir()}
-    assert {"01", "02", "03", "04", "07"} <= {name[:2] for name in figures} and "scoreboard.png" in figures
+    assert {"01", "02", "03", "04", "07", "08"} <= {name[:2] for name in figures} and "scoreboard.png" in figures
 
 
 def test_the_scoreboard_has_every_claim_once_and_gives_no_verdict_at_smoke_size(undisturbed):

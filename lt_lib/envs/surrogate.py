@@ -33,7 +33,8 @@ class SurrogateScene:
         self._model = mujoco.MjModel.from_xml_string(scene_xml(layout, width, height, fovy))
         self._data = mujoco.MjData(self._model)
         _paint(self._model)
-        self._lamps = self._model.light_diffuse.copy(), self._model.vis.headlight.ambient.copy()
+        model = self._model
+        self._lights = model.light_diffuse.copy(), model.light_specular.copy(), model.vis.headlight.ambient.copy()
         try:
             self._renderer = mujoco.Renderer(self._model, height, width)
         except Exception as error:  # MuJoCo raises plain RuntimeError, FatalError or AttributeError, by platform
@@ -71,12 +72,12 @@ class SurrogateScene:
 
     def _light(self, level: float, dim: bool):
         """Both lamps, or one warm lamp; all light times `level`, of the display's numbers after gamma."""
-        lamps, ambient = self._lamps
-        colour = np.array(WARM) if dim else np.ones(3)
-        shown = level ** (1 / 2.2)
-        self._model.light_diffuse[:] = lamps * shown * colour
-        self._model.light_diffuse[1] *= not dim
-        self._model.vis.headlight.ambient = ambient * shown * colour
+        diffuse, specular, ambient = self._lights
+        shown = level ** (1 / 2.2) * (np.array(WARM) if dim else np.ones(3))
+        on = np.array([[1.0], [0.0 if dim else 1.0]])  # the left lamp, the right lamp
+        self._model.light_diffuse[:] = diffuse * shown * on
+        self._model.light_specular[:] = specular * shown * on
+        self._model.vis.headlight.ambient = ambient * shown
 
 
 def scene_xml(layout: Layout, width: int, height: int, fovy: float) -> str:

@@ -55,6 +55,7 @@ def capture(options: argparse.Namespace) -> list[str]:
     Raises UserError for a source that cannot be opened or ends too early, a frame smaller than the crop, another crop
     than the folder states, and a placement that the session already has. Nothing is written then.
     """
+    _check_numbers(options)
     writable_folder(options.folder)
     rows = _earlier(options)
     frames = list(_frames(options.source, options.shots, options.skip))
@@ -62,13 +63,20 @@ def capture(options: argparse.Namespace) -> list[str]:
     if not CROP <= options.crop <= min(height, width):
         raise UserError(f"--crop {options.crop} must lie between {CROP} and the frame's {min(height, width)} pixels")
     stem = f"{options.session}_{options.placement:03d}"
-    files = [f"{stem}_{chr(ord('a') + i)}.png" for i in range(len(frames))]
+    files = [f"{stem}_{i}.png" for i in range(1, len(frames) + 1)]
     for name, frame in zip(files, frames, strict=True):
         write_atomically(options.folder / name, cv2.imencode(".png", frame)[1].tobytes())
     labels = (options.session, options.placement, options.distance, options.lighting, options.hazard)
     write_atomically(options.folder / OPTICS, f"crop: {options.crop}\n".encode())
     write_atomically(options.folder / LABELS, _table([*rows, *((name, *labels) for name in files)]))
     return files
+
+
+def _check_numbers(options: argparse.Namespace) -> None:
+    for name, least in (("shots", 1), ("skip", 0), ("placement", 0), ("distance", 0)):
+        value = getattr(options, name)
+        if not least <= value < np.inf:
+            raise UserError(f"--{name} must be {least} or more, got {value}")
 
 
 def _earlier(options: argparse.Namespace) -> list[tuple]:
