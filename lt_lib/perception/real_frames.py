@@ -25,7 +25,7 @@ COLUMNS = ("file", "session", "placement", "distance_cm", "lighting", "hazard")
 SESSIONS = ("refit", "validation", "live")
 WORDS = {"session": SESSIONS, "lighting": ("bright", "dim"), "hazard": ("0", "1")}
 SUFFIXES = (".png", ".jpg", ".jpeg")
-SAME = 1.0  # grey levels: crops whose mean difference is less are one frame, saved twice
+SAME = 2.0  # grey levels: crops whose mean difference is less are one frame, saved twice
 
 
 def read_sessions(folder: Path) -> dict[str, Session]:

@@ -128,11 +128,12 @@ def spread(seeds: Mapping[str, Sequence[float]], selected: Mapping[str, float], 
 
 
 def what_breaks(
-    curves: Mapping[str, Mapping[str, Float[np.ndarray, " s"]]],
-    seeds: Mapping[str, Float[np.ndarray, "n s"]],
-    nominal: Mapping[str, float],
+    curves: Mapping[str, Mapping[str, np.ndarray]], seeds: Mapping[str, np.ndarray], nominal: Mapping[str, float]
 ) -> Figure:
-    """Balanced accuracy against the strength of each effect; the triangle is the strength that the sessions have."""
+    """Balanced accuracy against the strength of each effect; the triangle is the strength that the sessions have.
+
+    curves  by effect and encoder, (S,) one a strength;  seeds  by effect, (N, S), one row an encoder seed
+    """
     columns = min(5, len(curves))
     lines = -(-len(curves) // columns)
     figure = Figure(figsize=(3.0 * columns + 0.5, 2.7 * lines + 0.5), layout="constrained")
@@ -170,9 +171,9 @@ def under_effect(transfer: Transfer, encoder: Result, sweep: Result) -> Float[np
 
 
 def break_table(
-    pair: Mapping[str, Mapping[str, Float[np.ndarray, " s"]]], many: Mapping[str, Float[np.ndarray, "n s"]], gate: float
+    pair: Mapping[str, Mapping[str, np.ndarray]], many: Mapping[str, np.ndarray], gate: float
 ) -> pd.DataFrame:
-    """Balanced accuracy at the greatest strength of each effect, an effect a row."""
+    """Balanced accuracy at the greatest strength of each effect, an effect a row; arguments as for `what_breaks`."""
     rows = {}
     for effect, encoders in pair.items():
         worst = {name: f"{values[-1]:.2f}" for name, values in encoders.items()}
