@@ -477,7 +477,7 @@ class BenchConfig(Settings):
     position: NonNegativeFloat = 3.0  # cm, +- of the robot's place by hand
     heading: NonNegativeFloat = 2.0  # degrees, +- of its heading by hand
     clutter: Annotated[int, Field(ge=0, le=12)] = 4  # objects on the floor
-    dim: NonNegativeFloat = 1.0  # stops by which the dim lighting state is darker
+    dim: NonNegativeFloat = 1.0  # stops by which the dim state's light is turned down, besides a lamp that is off
 
 
 class SessionConfig(Training):

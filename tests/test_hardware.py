@@ -188,24 +188,30 @@ def test_the_surrogate_shares_the_layout_s_geometry_with_the_fast_camera():
     placements = draw_placements(LAYOUT, config, rng(1))._replace(slab_offset=np.zeros((3, 3)))
     scene = SurrogateScene(LAYOUT, WIDTH, HEIGHT, optics.FOCAL * optics.OVERSAMPLING)
     for i, simulated in enumerate(simulated_frames(LAYOUT, placements)):
-        picture = scene.picture(placements, i, 0, 0.0)
+        picture = scene.picture(placements, i, 0)
         frame = optics.crop(optics.expose(picture, PERFECT, STEADY, rng())).astype(float)
         red = frame[..., 0] > 2 * frame[..., 1:].max(-1)
         assert (red == HAZARD[simulated]).mean() > 0.98
     scene.close()
 
 
-def test_a_dim_placement_is_darker_and_clutter_is_where_it_was_asked_for():
+def test_a_dim_placement_is_darker_and_warmer_and_clutter_is_where_it_was_asked_for():
     config = SessionConfig(hazard=1, clear=1, bench=QUIET, lighting=["dim"])
     placements = draw_placements(LAYOUT, config, rng(2))
+    lit = placements._replace(dim=np.zeros(2, bool))
     scene = SurrogateScene(LAYOUT, WIDTH, HEIGHT, optics.FOCAL * optics.OVERSAMPLING)
-    bright = scene.picture(placements._replace(dim=np.zeros(2, bool)), 0, 0, 2.0)
-    one, four = (optics.linear(scene.picture(placements, 0, 0, stops)).mean() for stops in (0.0, 2.0))
-    cluttered = scene.picture(placements._replace(dim=np.zeros(2, bool)), 0, 12, 2.0)
+    dark, bright, cluttered = scene.picture(placements, 0, 0), scene.picture(lit, 0, 0), scene.picture(lit, 0, 12)
     scene.close()
-    assert one < optics.linear(bright).mean()
-    assert one / four == pytest.approx(4, rel=0.3)  # two stops
+    red, _, blue = dark[HEIGHT // 2 :].mean((0, 1)) / bright[HEIGHT // 2 :].mean((0, 1))
+    assert blue < red < 1
     assert (cluttered != bright).any(-1).mean() > 0.02
+
+
+def test_the_dim_state_turns_the_light_down_by_its_stops():
+    config = SessionConfig(hazard=1, clear=1, shots=1, optics=PERFECT, lighting=["dim"])
+    full, quarter = (film_session(with_effect(config, "dim", stops), 0, report=nothing) for stops in (0.0, 2.0))
+    ratio = optics.linear(full["frames"][0]).mean() / optics.linear(quarter["frames"][0]).mean()
+    assert ratio == pytest.approx(4, rel=0.1)
 
 
 def test_a_session_is_filmed_alike_from_one_seed_and_cut_to_its_frames():
@@ -276,7 +282,7 @@ def trained():
 def test_training_is_pure_lowers_the_loss_and_serves_pictures_and_palette_frames_alike(trained):
     again = train_matched_encoder(TINY, 0, report=nothing)
     assert all(np.array_equal(trained[name], again[name]) for name in trained)
-    assert trained["loss.reconstruction"][-3:].mean() < 0.95 * trained["loss.reconstruction"][:3].mean()
+    assert trained["loss.reconstruction"][-3:].mean() < 0.985 * trained["loss.reconstruction"][:3].mean()
     frames = random_rollouts(LAYOUT, 20, 1, rng(9)).frames[:, 0]
     pictures = PictureEncoder(trained).latents(colours(frames))
     np.testing.assert_allclose(pictures, FrozenEncoder(trained).latent(frames).numpy(), atol=1e-4)
@@ -327,7 +333,7 @@ def test_a_shift_spares_the_direction_and_costs_the_operating_point():
         """An encoder whose camera adds a constant."""
 
         def __init__(self):
-            self.shifts = iter([0.0, 9.0, 9.0])
+            self.shifts = iter([0.0, 20.0, 20.0])
 
         def latents(self, _):
             return latents + next(self.shifts)
@@ -374,7 +380,7 @@ def test_a_gate_file_that_changed_after_the_first_use_is_told(tmp_path):
     assert second.changed and second.registered == first.digest != second.digest
     assert "CHANGED AFTER THE FACT" in str(second)
     gates_file.write_text("decode: high")
-    with pytest.raises(UserError, match=r"^hardware.yaml: "):
+    with pytest.raises(UserError, match=r"^hardware.yaml.candidates: Field required"):
         register(outputs, gates_file)
 
 

@@ -40,10 +40,10 @@ class SurrogateScene:
         except Exception as error:  # MuJoCo raises plain RuntimeError, FatalError or AttributeError, by platform
             raise UserError("the surrogate camera found no OpenGL; see README, Running") from error
 
-    def picture(self, placements: Placements, i: int, clutter: int, dim: float) -> UInt8[np.ndarray, "h w 3"]:
-        """Placement i, RGB; `clutter` objects on the floor, the lamps `dim` stops darker if it is a dim one."""
+    def picture(self, placements: Placements, i: int, clutter: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Placement i, RGB, with `clutter` objects on the floor; under two lamps, or under one if it is a dim one."""
         self._place(placements, i, clutter)
-        self._light(2.0**-dim if placements.dim[i] else 1.0, bool(placements.dim[i]))
+        self._light(bool(placements.dim[i]))
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, camera="eye")
         return self._renderer.render().copy()
@@ -70,14 +70,13 @@ class SurrogateScene:
         self._data.mocap_pos[mocap] = position
         self._data.mocap_quat[mocap] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
 
-    def _light(self, level: float, dim: bool):
-        """Both lamps, or one warm lamp; all light times `level`, of the display's numbers after gamma."""
+    def _light(self, dim: bool):
+        """Both lamps, or the left one alone and warm."""
         diffuse, specular, ambient = self._lights
-        shown = level ** (1 / 2.2) * (np.array(WARM) if dim else np.ones(3))
-        on = np.array([[1.0], [0.0 if dim else 1.0]])  # the left lamp, the right lamp
-        self._model.light_diffuse[:] = diffuse * shown * on
-        self._model.light_specular[:] = specular * shown * on
-        self._model.vis.headlight.ambient = ambient * shown
+        colour, on = np.array(WARM) if dim else np.ones(3), np.array([[1.0], [0.0 if dim else 1.0]])
+        self._model.light_diffuse[:] = diffuse * colour * on
+        self._model.light_specular[:] = specular * colour * on
+        self._model.vis.headlight.ambient = ambient * colour
 
 
 def scene_xml(layout: Layout, width: int, height: int, fovy: float) -> str:

@@ -57,7 +57,7 @@ def film_session(config: SessionConfig, seed: int, *, report: Callable[[float], 
     """The fields of `Session` from the surrogate camera, and "views" (6, 120, 160, 3), whole frames for pictures."""
     rng = np.random.default_rng([seed, 10])
     placements = draw_placements(load_layout(config.layout), config, rng)
-    taken = _expose(_pictures(config, placements, report), config, rng)
+    taken = _expose(_pictures(config, placements, report), placements, config, rng)
     session = _labelled(np.stack([optics.crop(frame) for frame in taken]), placements, config)
     return session._asdict() | {"views": np.stack(taken[: 6 * config.shots : config.shots])}
 
@@ -71,7 +71,7 @@ def film_sweep(config: SweepConfig, seed: int, *, report: Callable[[float], None
         placements = draw_placements(load_layout(config.layout), changed, rng)
         if changed.bench != drawn:  # what only the camera changes need not be rendered again
             pictures, drawn = _pictures(changed, placements, report), changed.bench
-        frames.append([optics.crop(frame) for frame in _expose(pictures, changed, rng)])
+        frames.append([optics.crop(frame) for frame in _expose(pictures, placements, changed, rng)])
         report((i + 1) / len(strengths))
     return {"frames": np.array(frames), "hazard": _labelled(np.array(frames[0]), placements, config).hazard}
 
@@ -92,19 +92,22 @@ def _pictures(config: SessionConfig, placements: Placements, report) -> list[UIn
     scene = SurrogateScene(load_layout(config.layout), width, height, optics.FOCAL * optics.OVERSAMPLING)
     pictures = []
     for i in range(len(placements.side)):
-        pictures.append(scene.picture(placements, i, config.bench.clutter, config.bench.dim))
+        pictures.append(scene.picture(placements, i, config.bench.clutter))
         report((i + 1) / len(placements.side))
     scene.close()
     return pictures
 
 
-def _expose(pictures, config: SessionConfig, rng: np.random.Generator) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Whole frames of the camera, `shots` a picture."""
+def _expose(
+    pictures, placements: Placements, config: SessionConfig, rng: np.random.Generator
+) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Whole frames of the camera, `shots` a picture; the dim state turns all light down."""
     frames = []
-    for picture in pictures:
+    for picture, dim in zip(pictures, placements.dim, strict=True):
+        level = 2.0**-config.bench.dim if dim else 1.0
         for _ in range(config.shots):
             shot = optics.draw_shot(config.optics, rng)
-            frames.append(optics.expose(picture, config.optics, shot, rng))
+            frames.append(optics.expose(picture, config.optics, shot._replace(exposure=level * shot.exposure), rng))
     return frames
 
 
