@@ -15,7 +15,7 @@ from lt_lib.envs.layout import load_layout
 from lt_lib.envs.materials import HAZARD, INDEX, PALETTE
 from lt_lib.envs.surrogate import SurrogateScene
 from lt_lib.learners.executor import Executor
-from lt_lib.learners.hardware import FILMED, HardwareProtocol, measure_rails
+from lt_lib.learners.hardware import FILMED, HardwareProtocol, past_the_rails
 from lt_lib.params import (
     BenchConfig,
     HardwareGates,
@@ -227,6 +227,8 @@ def test_a_session_is_filmed_alike_from_one_seed_and_cut_to_its_frames():
 def test_a_sweep_changes_one_thing_on_the_same_placements():
     sweep = film_sweep(SweepConfig(effect="mosaic", hazard=1, clear=1, shots=1), 0, report=nothing)
     assert sweep["frames"].shape == (2, 2, 64, 64, 3)
+    off, on = sweep["frames"].astype(int)
+    assert 0 < np.abs(on - off).mean() < 12 < np.abs(on - off[::-1]).mean()  # the same two pictures
     for effect, (_, strengths) in EFFECTS.items():
         changed = [with_effect(SessionConfig(), effect, s) for s in strengths]
         assert len(set(changed)) == len(strengths)
@@ -307,8 +309,8 @@ def test_rails_count_components_beyond_one_by_route_and_axis(trained):
     policy = Executor()
     weights = {name: np.zeros_like(value.numpy()) for name, value in policy.state_dict().items()}
     weights["mean.4.bias"] = np.array([1.01, -3.0, 0.99], np.float32)  # whatever it sees
-    found = measure_rails(RailsConfig(rollouts=2, length=2), 0, report=nothing, encoder=trained, executor=weights)
-    assert found["past"].tolist() == [[1, 1, 0], [1, 1, 0]]
+    past = past_the_rails(RailsConfig(rollouts=2, length=2), trained, weights)
+    assert past.tolist() == [[1, 1, 0], [1, 1, 0]]
 
 
 # --- probe and statistics

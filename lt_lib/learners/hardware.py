@@ -1,6 +1,6 @@
 """The hardware protocol, stage by stage (Section Hardware): what notebook 08 asks the run store for."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -135,32 +135,17 @@ class HardwareProtocol:
         live = self.sessions.live
         return {effect: float((live.optics.model_dump() | live.bench.model_dump())[effect]) for effect in effects}
 
-    def rails_of(self, encoder: Result) -> Result:
-        """How bang-bang the executor is that was pretrained behind an encoder at matched optics."""
-        executor = self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
-        inputs = {"encoder": encoder, "executor": executor}
-        found = self.store.fetch([Run(measure_rails, self.rails, SEED, inputs)], "rails")[0]
-        return found | {"obedient": executor["curve.obedient"]}
+    def driver(self, encoder: Result) -> Result:
+        """The executor that is pretrained behind an encoder at matched optics."""
+        return self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
 
 
-def measure_rails(
-    config: RailsConfig,
-    seed: int,
-    *,
-    report: Callable[[float], None],
-    encoder: Mapping[str, np.ndarray],
-    executor: Mapping[str, np.ndarray],
-) -> dict:
-    """Share of pre-clamp action components past the rails, "past" (route, axis), on frames of held-out rollouts."""
+def past_the_rails(config: RailsConfig, encoder: Result, executor: Result) -> Float[np.ndarray, "routes axes"]:
+    """Share of an executor's action components beyond +-1 before clipping, on frames of held-out rollouts."""
     device = best_device(config.device)
-    layout = load_layout(config.layout)
-    rollouts = random_rollouts(layout, config.rollouts, config.length, np.random.default_rng([seed, 13]))
-    latents = encode(FrozenEncoder(encoder, device), rollouts.frames).reshape(-1, 64)
-    report(0.5)
+    rng = np.random.default_rng([SEED, 13])
+    rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
+    latents = torch.from_numpy(encode(FrozenEncoder(encoder, device), rollouts.frames)).flatten(0, 1).to(device)
     driver = FrozenExecutor(executor, device)
-    return {"past": np.stack([_past(driver, latents, route, device) for route in range(ROUTES)])}
-
-
-def _past(driver: FrozenExecutor, latents, route: int, device: str) -> Float[np.ndarray, "3"]:
-    actions = driver.mean_action(torch.from_numpy(latents).to(device), np.full(len(latents), route))
-    return (np.abs(actions) > 1).mean(axis=0)
+    actions = [driver.mean_action(latents, np.full(len(latents), route)) for route in range(ROUTES)]
+    return (np.abs(actions) > 1).mean(axis=1)

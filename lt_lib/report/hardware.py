@@ -28,9 +28,9 @@ def rows_of_pictures(rows: Mapping[str, UInt8[np.ndarray, "n h w 3"]]) -> Figure
     panels = figure.subplots(len(rows), columns, squeeze=False)
     for line, (name, pictures) in zip(panels, rows.items(), strict=True):
         for axes, picture in zip_longest(line, pictures):
+            axes.set(xticks=[], yticks=[], frame_on=picture is not None)
             if picture is not None:
                 axes.imshow(picture)
-            axes.set(xticks=[], yticks=[])
         line[0].set_ylabel(name, fontsize=8)
     return figure
 
@@ -108,7 +108,7 @@ def scores(transfer: Transfer, sessions: Mapping[str, Session], rng: np.random.G
 
 def spread(seeds: Mapping[str, Sequence[float]], selected: Mapping[str, float], plain: Mapping[str, float]) -> Figure:
     """Balanced accuracy of the refit probe by session: a dot an encoder seed, marks the two larger encoders."""
-    figure = Figure(figsize=(7.5, 3.8), layout="constrained")
+    figure = Figure(figsize=(9.5, 3.8), layout="constrained")
     axes = figure.subplots()
     for x, (name, values) in enumerate(seeds.items()):
         low, high = stats.mean_interval(values)
@@ -123,7 +123,7 @@ def spread(seeds: Mapping[str, Sequence[float]], selected: Mapping[str, float], 
     chance_line(axes)
     axes.set_xticks(range(len(seeds)), list(seeds))
     axes.set(ylim=(0.4, 1.03), ylabel="balanced accuracy\nof the refit probe")
-    axes.legend(fontsize=8, loc="lower left")
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     return figure
 
 
