@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from lt_lib.perception.matched import PictureEncoder
 from lt_lib.perception.probe import Transfer, decoded, frechet, placements_right, red_shares
@@ -154,10 +155,13 @@ def what_breaks(
         axes.set_ylim(0.4, 1.03)
     for axes in panels[len(curves) :]:
         axes.set_axis_off()
-    for name, (colour, line, marker) in styles.items():
-        panels[0].plot([], [], line, marker=marker, color=colour, label=name)
-    panels[0].plot([], [], color="0.6", label="encoder seeds, cheaper size")
-    panels[0].legend(fontsize=7, loc="lower left", bbox_to_anchor=(0.0, 0.1))
+    handles = [
+        Line2D([], [], color=colour, ls=line, marker=marker, label=name)
+        for name, (colour, line, marker) in styles.items()
+    ]
+    handles += [Line2D([], [], color="0.6", label="encoder seeds of the cheaper size, with randomisation")]
+    handles += [Line2D([], [], color="black", marker="^", ls="", label="strength in the sessions")]
+    figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=8)
     figure.supylabel("balanced accuracy of the refit probe")
     return figure
 
