@@ -225,10 +225,14 @@ def test_a_session_is_filmed_alike_from_one_seed_and_cut_to_its_frames():
 
 
 def test_a_sweep_changes_one_thing_on_the_same_placements():
-    sweep = film_sweep(SweepConfig(effect="mosaic", hazard=1, clear=1, shots=1), 0, report=nothing)
-    assert sweep["frames"].shape == (2, 2, 64, 64, 3)
-    off, on = sweep["frames"].astype(int)
-    assert 0 < np.abs(on - off).mean() < 12 < np.abs(on - off[::-1]).mean()  # the same two pictures
+    bench = BenchConfig(position=0.0, heading=0.0)
+    config = SweepConfig(effect="clutter", hazard=2, clear=1, shots=1, bench=bench, optics=PERFECT, lighting=["bright"])
+    sweep = film_sweep(config, 0, report=nothing)
+    assert sweep["frames"].shape == (5, 3, 64, 64, 3)
+    for frames in sweep["frames"]:
+        assert ((red_shares(frames, 1.5) > 0.15) == sweep["hazard"]).all()
+    emptier, fuller = (sweep["frames"][i].astype(int) for i in (0, 4))
+    assert 0 < np.abs(fuller - emptier).mean() < np.abs(fuller - emptier[[1, 2, 0]]).mean() / 2  # the same placements
     for effect, (_, strengths) in EFFECTS.items():
         changed = [with_effect(SessionConfig(), effect, s) for s in strengths]
         assert len(set(changed)) == len(strengths)
