@@ -85,6 +85,18 @@ def decode_table(transfers: Mapping[str, Transfer]) -> pd.DataFrame:
     return pd.DataFrame(rows).T.round(3)
 
 
+def fallback(transfer: Transfer, gate: float) -> str:
+    """What the registered rule says: the refit probe takes the place of one that misses the gate on the refit session."""
+    first = transfer.decoded(transfer.simulated, "refit").balanced
+    if first < gate:
+        return f"the registered fallback applies: {first:.3f} on the refit session misses the gate of {gate}"
+    live = transfer.decoded(transfer.simulated, "live").balanced
+    return (
+        f"the registered rule would have kept the probe fitted in simulation ({first:.3f} on the refit session), "
+        f"whose live balanced accuracy is {live:.3f}; the value is the refit probe's where there is one"
+    )
+
+
 def scores(transfer: Transfer, sessions: Mapping[str, Session], rng: np.random.Generator) -> Figure:
     """Both probes' scores of every camera decision; the threshold is the dotted line at 0."""
     figure = Figure(figsize=(11, 4.2), layout="constrained")
