@@ -86,7 +86,7 @@ def decode_table(transfers: Mapping[str, Transfer]) -> pd.DataFrame:
 
 
 def fallback(transfer: Transfer, gate: float) -> str:
-    """What the registered rule says: the refit probe takes the place of one that misses the gate on the refit session."""
+    """What the registered rule says of the probe fitted in simulation, judged on the refit session."""
     first = transfer.decoded(transfer.simulated, "refit").balanced
     if first < gate:
         return f"the registered fallback applies: {first:.3f} on the refit session misses the gate of {gate}"
