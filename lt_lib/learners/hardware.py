@@ -82,12 +82,6 @@ class HardwareProtocol:
         runs = [Run(train_matched_encoder, self.config(name), SEED) for name in names]
         return dict(zip(names, self.store.fetch(runs, "matched encoders"), strict=True))
 
-    def cheap_encoders(self, candidate: str, seeds: int) -> list[Result]:
-        """Encoders of the cheaper size in the appearances of a candidate, one a seed."""
-        config = self.cheap.model_copy(update=self.gates.candidates[candidate])
-        runs = [Run(train_matched_encoder, config, seed) for seed in range(seeds)]
-        return self.store.fetch(runs, "encoder seeds")
-
     def gate_reports(self, encoders: Mapping[str, Result]) -> dict[str, Result]:
         """What each encoder shows at the gates; see `perception.matched.Shown`."""
         runs = [Run(measure_matched_gates, self.checks, SEED, {"encoder": encoder}) for encoder in encoders.values()]
@@ -135,9 +129,16 @@ class HardwareProtocol:
         live = self.sessions.live
         return {effect: float((live.optics.model_dump() | live.bench.model_dump())[effect]) for effect in effects}
 
-    def driver(self, encoder: Result) -> Result:
-        """The executor that is pretrained behind an encoder at matched optics."""
-        return self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
+    def after_selection(self, candidate: str, encoder: Result, seeds: int) -> tuple[Result, list[Result]]:
+        """The executor behind the selected encoder, and encoders of the cheaper size in its appearances, one a seed.
+
+        They are computed side by side, since neither waits for the other.
+        """
+        config = self.cheap.model_copy(update=self.gates.candidates[candidate])
+        runs = [Run(train_executor, self.executor, SEED, {"encoder": encoder})]
+        runs += [Run(train_matched_encoder, config, seed) for seed in range(seeds)]
+        driver, *cheap = self.store.fetch(runs, "executor and encoder seeds")
+        return driver, cheap
 
 
 def past_the_rails(config: RailsConfig, encoder: Result, executor: Result) -> Float[np.ndarray, "routes axes"]:
