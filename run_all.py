@@ -39,7 +39,7 @@ NEEDS = {
 # What this script gives to every notebook, over what the profile says.
 GIVEN = ("profile", "outputs", "workers")
 # What names things that may not exist or not fit; checked before computing.
-INPUTS = ("layout", "weights", "seeds", "gridworld", "peek_layout")
+INPUTS = ("layout", "weights", "seeds", "gridworld", "peek_layout", "frames", "effects", "gate_file")
 CELL_LIMIT_S = 6 * 3600
 
 

@@ -20,7 +20,11 @@ def settled(parameters: Mapping[str, Any], root: Path = ROOT) -> dict[str, Any]:
 
 
 def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
-    """Raises UserError, one line, for an impossible or revealing layout, unusable weights or an unknown condition."""
+    """Raises UserError, one line, for what cannot work.
+
+    An impossible or revealing layout, unusable weights, an unknown condition or camera effect, a gate file that is
+    none, a folder of real frames with a mistake in it.
+    """
     if "layout" in parameters:
         from lt_lib.envs.layout import load_layout  # here, since the compiled camera takes seconds to import
         from lt_lib.envs.occlusion import require_occlusion
@@ -39,6 +43,8 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
         unknown = sorted(set(parameters["seeds"]) - set(known))
         if unknown:
             raise UserError(f"seeds: unknown message condition '{unknown[0]}'; there are {', '.join(known)}")
+    if "effects" in parameters:
+        _check_hardware(parameters, root)
     if "gridworld" in parameters:
         _check_gridworld(parameters)
 
@@ -49,6 +55,19 @@ def check_cluster(address: str) -> None:
 
     with connected(address):
         pass
+
+
+def _check_hardware(parameters: Mapping[str, Any], root: Path) -> None:
+    from lt_lib.perception.real_frames import read_sessions
+    from lt_lib.perception.sessions import EFFECTS
+    from lt_lib.report.registration import read_gates
+
+    unknown = sorted(set(parameters["effects"]) - set(EFFECTS))
+    if unknown:
+        raise UserError(f"effects: unknown camera effect '{unknown[0]}'; there are {', '.join(EFFECTS)}")
+    read_gates(root / parameters["gate_file"])
+    if parameters["frames"]:
+        read_sessions(root / parameters["frames"])
 
 
 def _check_gridworld(parameters: Mapping[str, Any]) -> None:
