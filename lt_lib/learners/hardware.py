@@ -51,7 +51,9 @@ class HardwareProtocol:
     folder: Path | None
 
     @classmethod
-    def of(cls, gates: HardwareGates, workers: int | str, device: str, frames: str, simulated: int, **sections: Mapping):
+    def of(
+        cls, gates: HardwareGates, workers: int | str, device: str, frames: str, simulated: int, **sections: Mapping
+    ):
         """From a notebook's parameters: `sections` are dicts for matched, cheap, checks, sessions, executor, rails."""
         kinds = {
             "matched": MatchedEncoderConfig,
