@@ -17,7 +17,8 @@ from lt_lib.learners.executor import Executor, FrozenExecutor
 from lt_lib.learners.route import train_head
 from lt_lib.params import BankConfig, HeadConfig, PpoConfig, layout_path
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
-from lt_lib.perception.jepa import Jepa, class_weights, colour_classes, covariance_loss, variance_loss
+from lt_lib.perception.jepa import GRID, colour_classes
+from lt_lib.perception.objective import Jepa, class_weights, covariance_loss, variance_loss
 
 LAYOUT = load_layout("default")
 EXACT = {"rtol": 1e-5, "atol": 1e-6}
@@ -116,14 +117,14 @@ def test_reconstruction_classes_come_from_colours_alone_and_weights_average_to_o
 
 def test_target_follows_by_moving_average_and_gets_no_gradient():
     torch.manual_seed(0)
-    model = Jepa(torch.ones(3))
+    model = Jepa(Encoder(), torch.ones(3), GRID)
     before = model.target.layers[0].weight.clone()
     with torch.no_grad():
         model.encoder.layers[0].weight.add_(1.0)
     model.follow(0.9)
     torch.testing.assert_close(model.target.layers[0].weight, before + 0.1, **EXACT)
-    frames, classes = torch.rand(4, 64, 64, 3), torch.zeros(4, 16, 16, dtype=torch.long)
-    sum(model.losses(frames, torch.zeros(4, 3), frames, classes)).backward()
+    frames, classes = torch.rand(4, 64, 64, 3), torch.zeros(4, GRID, GRID, dtype=torch.long)
+    sum(model.losses(model.encoder(frames), torch.zeros(4, 3), model.goal(frames), classes)).backward()
     assert all(p.grad is None for p in model.target.parameters())
     assert all(p.grad is not None for p in model.encoder.parameters())
 

@@ -65,14 +65,14 @@ class Arena:
         self._mocap[which, 1, :2] = scout[which, :2]
         self._observe()
 
-    def step(self, action: Float[np.ndarray, "n 3"]):
-        """One control step of 0.1 s; actions are clipped to [-1, 1]."""
+    def step(self, action: Float[np.ndarray, "n 3"], live: Bool[np.ndarray, " n"] | None = None):
+        """One control step of 0.1 s; actions are clipped to [-1, 1]. Scenes that are not `live` stand still."""
         vx, vy, turn = np.clip(action, -1.0, 1.0).T
         cos, sin = np.cos(self._qpos[:, 2]), np.sin(self._qpos[:, 2])
         self._ctrl[:, 0] = V_MAX * (cos * vx - sin * vy)
         self._ctrl[:, 1] = V_MAX * (sin * vx + cos * vy)
         self._ctrl[:, 2] = W_MAX * turn
-        self._batch.step(nstep=PHYSICS_HZ // CONTROL_HZ)
+        self._batch.step(None if live is None else np.flatnonzero(live), nstep=PHYSICS_HZ // CONTROL_HZ)
         self._observe()
 
     def _observe(self):

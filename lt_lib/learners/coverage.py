@@ -100,7 +100,7 @@ def play(
         action[live] = explore(mean, std, imposed.take(live), chain, age, rng)
         if age % EVERY == 0:
             done.path[live, age // EVERY] = arena.pose[live, :2]
-        arena.step(action)
+        arena.step(action, live)
         live = _record(done, arena, live, age + 1)
         report((age + 1) / horizon)
         if not live.any():

@@ -80,7 +80,7 @@ def drive(
     while finished < total:
         latent = encoder.latent(camera.frames(arena.pose, arena.slab, arena.scout[:, :2]))
         action = executor.mean_action(latent, route[episode])
-        arena.step(np.where(age[:, None] < commit_step, 0.0, action))
+        arena.step(np.where(age[:, None] < commit_step, 0.0, action), live)
         age += 1
         _record(outcome, episode[live], arena, live)
         ended = live & (arena.reached | (age >= HORIZON))

@@ -133,7 +133,8 @@ class LiveArena:
                 route[rows] = chance[at] < head.policy(wire).probs[:, 1].numpy()
                 log.append((seats.episode[rows], wire, route[rows]))
             before = arena.pose
-            arena.step(np.where(seats.age[:, None] < self._config.commit_step, 0.0, self._action(seats.live, route)))
+            action = self._action(seats.live, route)
+            arena.step(np.where(seats.age[:, None] < self._config.commit_step, 0.0, action), seats.live)
             seats.age += 1
             live, at = seats.live, (seats.episode[seats.live], number[seats.live])
             rewards[at] += ARRIVAL_REWARD * arena.reached[live] + CONTACT_REWARD * arena.contact[live]

@@ -1,6 +1,6 @@
 """The encoder E and predictor P (Sections Encoder and freeze, Implementation), and their frozen form."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from lt_lib.envs.camera import network_input
 
 LATENT = 64
 ACTION = 3
+CHUNK = 1024  # observations encoded at once where there are many
 
 
 class Encoder(nn.Module):
@@ -54,40 +55,62 @@ class Predictor(nn.Module):
         return latent + self.layers(torch.cat([latent, action], dim=1))
 
 
-class FrozenEncoder:
+class Frozen:
     """E and P after the freeze: no gradient ever, and a normalisation that was fixed before any policy existed.
 
     Built from a flat mapping of arrays ("E.*", "P.*", "mean", "std"), the form in which weights are stored and
-    handed to runs. `precision` is float32 (the reference) or bfloat16 (faster on CPUs that have it).
+    handed to runs. A subclass says what E is and how an observation enters it.
     """
 
-    def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu", precision: str = "float32"):
-        self.device, self._dtype = torch.device(device), getattr(torch, precision)
-        self._encoder, self._predictor = Encoder(), Predictor()
+    def __init__(self, encoder: nn.Module, weights: Mapping[str, np.ndarray], device: str, precision: str):
+        self.device, self.dtype = torch.device(device), getattr(torch, precision)
+        self._encoder, self._predictor = encoder, Predictor()
         for module, prefix in ((self._encoder, "E."), (self._predictor, "P.")):
             module.load_state_dict(
                 {k.removeprefix(prefix): torch.tensor(v) for k, v in weights.items() if k.startswith(prefix)}
             )
-            module.to(self.device, self._dtype).requires_grad_(False)
-        self._encoder.to(memory_format=torch.channels_last)
+            module.to(self.device, self.dtype).requires_grad_(False)
         self._mean = torch.tensor(weights["mean"], device=self.device)
         self._std = torch.tensor(weights["std"], device=self.device)
 
-    @torch.inference_mode()
-    def latent(self, frames: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b 64"]:
-        """Normalised latents of palette-index frames."""
-        return self._normalised(self._raw(frames))
+    def inputs(self, observations: UInt8[np.ndarray, "b ..."]) -> Tensor:
+        """Observations as E takes them."""
+        raise NotImplementedError
 
     @torch.inference_mode()
-    def predicted(self, frames: UInt8[np.ndarray, "b h w"], action: Float[Tensor, "b 3"]) -> Float[Tensor, "b 64"]:
-        """Normalised latents that P predicts for the next frame under an action."""
-        return self._normalised(self._predictor(self._raw(frames), action.to(self.device, self._dtype)))
+    def latent(self, observations: UInt8[np.ndarray, "b ..."]) -> Float[Tensor, "b 64"]:
+        """Normalised latents."""
+        return self._normalised(self._encoder(self.inputs(observations)))
 
-    def _raw(self, frames):
-        return self._encoder(torch.from_numpy(network_input(frames)).to(self.device, self._dtype))
+    @torch.inference_mode()
+    def predicted(
+        self, observations: UInt8[np.ndarray, "b ..."], action: Float[Tensor, "b 3"]
+    ) -> Float[Tensor, "b 64"]:
+        """Normalised latents that P predicts for the next observation under an action."""
+        raw = self._encoder(self.inputs(observations))
+        return self._normalised(self._predictor(raw, action.to(self.device, self.dtype)))
 
-    def _normalised(self, latent):
+    def _normalised(self, latent: Float[Tensor, "b 64"]) -> Float[Tensor, "b 64"]:
         return (latent.float() - self._mean) / self._std
+
+
+class FrozenEncoder(Frozen):
+    """For the fast camera's frames (B, H, W) of palette indices.
+
+    `precision` is float32 (the reference) or bfloat16 (faster on CPUs that have it).
+    """
+
+    def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu", precision: str = "float32"):
+        super().__init__(Encoder(), weights, device, precision)
+
+    def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b h w 3"]:
+        return torch.from_numpy(network_input(observations)).to(self.device, self.dtype)
+
+
+def in_chunks(encode: Callable[[np.ndarray], Tensor], observations: np.ndarray) -> Float[np.ndarray, "n 64"]:
+    """What `encode` makes of n observations, CHUNK at a time, so that memory does not grow with n."""
+    parts = [encode(observations[i : i + CHUNK]).cpu() for i in range(0, len(observations), CHUNK)]
+    return torch.cat(parts).numpy()
 
 
 def best_device(name: str) -> str:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from scipy.stats import t
 from sklearn.linear_model import LinearRegression, LogisticRegression
@@ -17,11 +16,10 @@ from sklearn.manifold import TSNE
 
 from lt_lib.envs.layout import load_layout
 from lt_lib.params import GateConfig, Gates, UserError
-from lt_lib.perception.encoder import LATENT, FrozenEncoder, best_device
+from lt_lib.perception.encoder import LATENT, FrozenEncoder, best_device, in_chunks
 from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixels
 
 PROBE_SHARE = 0.7  # of the held-out rollouts train the probes, the rest test them
-CHUNK = 1024
 
 
 class GateError(UserError):
@@ -49,9 +47,7 @@ def effective_rank(latent: Float[np.ndarray, "b d"], power: int = 1) -> float:
 
 def encode(encoder: FrozenEncoder, frames: UInt8[np.ndarray, "*batch h w"]) -> Float[np.ndarray, "*batch d"]:
     """Normalised latents of any number of frames."""
-    flat = frames.reshape(-1, *frames.shape[-2:])
-    latents = torch.cat([encoder.latent(flat[i : i + CHUNK]).cpu() for i in range(0, len(flat), CHUNK)])
-    return latents.numpy().reshape(*frames.shape[:-2], LATENT)
+    return in_chunks(encoder.latent, frames.reshape(-1, *frames.shape[-2:])).reshape(*frames.shape[:-2], LATENT)
 
 
 def measure_gates(
@@ -101,11 +97,18 @@ def _picture(rollouts, latents, n: int, rng: np.random.Generator) -> dict:
 
 def require_gates(found: Mapping[str, float], gates: Gates) -> None:
     """Raises GateError unless the checkpoint passes every pre-registered gate."""
-    limits = {
-        "hazard": ("linear hazard-visible probe", max(gates.hazard, found["majority"])),
-        "walls": ("wall-count R^2", gates.walls),
-        "rank": ("effective rank", gates.rank),
-    }
+    require(
+        found,
+        {
+            "hazard": ("linear hazard-visible probe", max(gates.hazard, found["majority"])),
+            "walls": ("wall-count R^2", gates.walls),
+            "rank": ("effective rank", gates.rank),
+        },
+    )
+
+
+def require(found: Mapping[str, float], limits: Mapping[str, tuple[str, float]]) -> None:
+    """Raises GateError naming what is found to be short of its limit; limits are {name: (words, least value)}."""
     failed = [
         f"{words} {found[name]:.3f} is {limit - found[name]:.3f} short of {limit:.3f}"
         for name, (words, limit) in limits.items()

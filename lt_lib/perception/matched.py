@@ -1,4 +1,4 @@
-"""The encoder rebuilt at the camera's optics (Section Hardware): the objective of `jepa.py`, random floors and walls.
+"""The encoder rebuilt at the camera's optics (Section Hardware): the same objective, random floors and walls.
 
 The auxiliary read-out must rebuild the frame's own colours, the random ones; no label enters, here as there.
 """
@@ -11,38 +11,32 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.metrics import balanced_accuracy_score
+from torch import Tensor
 
 from lt_lib.envs.layout import load_layout
 from lt_lib.params import HardwareGates, MatchedEncoderConfig, MatchedGateConfig, UserError
-from lt_lib.perception.encoder import LATENT, Encoder, best_device
+from lt_lib.perception.encoder import LATENT, Encoder, Frozen, best_device, in_chunks
 from lt_lib.perception.frames import Rollouts, hazard_visible, random_rollouts, wall_pixels
 from lt_lib.perception.gates import PROBE_SHARE, effective_rank
-from lt_lib.perception.jepa import GRID, LEVELS, Jepa, Losses, class_weights
+from lt_lib.perception.jepa import GRID, LEVELS
+from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 from lt_lib.perception.randomise import Appearances, draw_appearances, eight_bits, recoloured
 
-CHUNK = 1024
 SAMPLE = 2_048  # frames that the class weights and the normalisation are taken from
 
 
-class PictureEncoder:
-    """A frozen encoder for RGB pictures of 64 x 64, from the flat mapping that `train_matched_encoder` returns."""
+class PictureEncoder(Frozen):
+    """For RGB pictures (B, 64, 64, 3), from the flat mapping that `train_matched_encoder` returns."""
 
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu"):
-        self._device, self._encoder = torch.device(device), Encoder()
-        self._encoder.load_state_dict(
-            {name.removeprefix("E."): torch.tensor(v) for name, v in weights.items() if name.startswith("E.")}
-        )
-        self._encoder.to(self._device).requires_grad_(False)
-        self._mean, self._std = weights["mean"], weights["std"]
+        super().__init__(Encoder(), weights, device, "float32")
 
-    @torch.inference_mode()
+    def inputs(self, observations: UInt8[np.ndarray, "b 64 64 3"]) -> Float[Tensor, "b 64 64 3"]:
+        return torch.from_numpy(observations.astype(np.float32) / 255).to(self.device)
+
     def latents(self, pictures: UInt8[np.ndarray, "n 64 64 3"]) -> Float[np.ndarray, "n 64"]:
-        """Normalised latents."""
-        parts = [
-            self._encoder(torch.from_numpy(pictures[i : i + CHUNK].astype(np.float32) / 255).to(self._device)).cpu()
-            for i in range(0, len(pictures), CHUNK)
-        ]
-        return (torch.cat(parts).numpy() - self._mean) / self._std
+        """Normalised latents of any number of pictures."""
+        return in_chunks(self.latent, pictures)
 
 
 def colour_codes(colours: Float[np.ndarray, "b h w 3"]) -> Int[np.ndarray, "b g g"]:
@@ -67,48 +61,25 @@ def train_matched_encoder(config: MatchedEncoderConfig, seed: int, *, report: Ca
     device = best_device(config.device)
     with torch.random.fork_rng(devices=[]):  # module initialisation draws from torch's global generator
         torch.manual_seed(seed)
-        model = Jepa(class_weights(colour_codes(sample), LEVELS**3)).to(device)
-    curves = _fit(model, rollouts, looks, config, rng, report)
+        model = Jepa(Encoder(), class_weights(colour_codes(sample), LEVELS**3), GRID).to(device)
+    frames, actions = rollouts.frames, torch.from_numpy(rollouts.actions)
+
+    def losses(r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Losses:
+        now, following = (recoloured(frames[r, t + k], looks.of(r)) for k in (0, 1))
+        codes = torch.from_numpy(colour_codes(now)).to(device)
+        goal = model.goal(torch.from_numpy(following).to(device))
+        latent = model.encoder(torch.from_numpy(now).to(device))
+        return model.losses(latent, actions[r, t].to(device), goal, codes)
+
+    curves = fit(model, losses, frames.shape[:2], config, rng, report)
     with torch.no_grad():
-        latents = model.encoder(torch.from_numpy(sample).to(device)).cpu().double()
-    weights = {
-        f"{p}.{k}": v.cpu().numpy()
-        for p, m in (("E", model.encoder), ("P", model.predictor))
-        for k, v in m.state_dict().items()
-    }
-    moments = {"mean": latents.mean(0).float().numpy(), "std": (latents.std(0) + 1e-6).float().numpy()}
-    return weights | moments | {f"loss.{name}": curves[:, i].copy() for i, name in enumerate(Losses._fields)}
+        latents = model.encoder(torch.from_numpy(sample).to(device)).cpu().numpy()
+    return frozen(model, latents) | curves
 
 
 def _sample(rollouts: Rollouts, looks: Appearances, rng: np.random.Generator) -> Float[np.ndarray, "n h w 3"]:
     r, t = (rng.integers(0, n, SAMPLE) for n in rollouts.frames.shape[:2])
     return recoloured(rollouts.frames[r, t], looks.of(r))
-
-
-def _fit(model: Jepa, rollouts: Rollouts, looks: Appearances, config, rng: np.random.Generator, report):
-    frames, device = rollouts.frames, model.class_weights.device
-    actions = torch.from_numpy(rollouts.actions)
-    pairs = np.argwhere(np.ones((frames.shape[0], frames.shape[1] - 1), bool))
-    updates = int(config.epochs * len(pairs) / config.batch)
-    curves = np.zeros((updates, len(Losses._fields)), np.float32)
-    optimiser = torch.optim.Adam(model.parameters(), lr=config.lr)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.lr, total_steps=updates + 1)
-    scale = torch.tensor([config.prediction, config.variance, config.covariance, config.reconstruction], device=device)
-    order = np.concatenate([rng.permutation(pairs) for _ in range(int(np.ceil(config.epochs)))])
-    for update in range(updates):
-        r, t = order[update * config.batch : (update + 1) * config.batch].T
-        now, following = (recoloured(frames[r, t + k], looks.of(r)) for k in (0, 1))
-        codes = torch.from_numpy(colour_codes(now)).to(device)
-        inputs = (torch.from_numpy(each).to(device) for each in (now, following))
-        losses = torch.stack(model.losses(next(inputs), actions[r, t].to(device), next(inputs), codes))
-        optimiser.zero_grad()
-        (scale * losses).sum().backward()
-        optimiser.step()
-        schedule.step()
-        model.follow(config.ema)
-        curves[update] = losses.detach().cpu()
-        report((update + 1) / updates)
-    return curves
 
 
 class Shown(NamedTuple):

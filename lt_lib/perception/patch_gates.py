@@ -18,7 +18,7 @@ from lt_lib.envs.gridworld import HAZARD, PATCH, Grid
 from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.params import PatchGateConfig, PatchGates
 from lt_lib.perception.encoder import LATENT
-from lt_lib.perception.gates import GateError, effective_rank
+from lt_lib.perception.gates import effective_rank, require
 from lt_lib.perception.patches import FrozenPatchEncoder
 
 
@@ -65,15 +65,11 @@ def measure_patch_gates(
 
 def require_patch_gates(found: Mapping[str, float], gates: PatchGates) -> None:
     """Raises GateError unless the checkpoint passes every pre-registered gate."""
-    limits = {
-        "hazard": ("hazard-visible probe in unseen cells", max(gates.hazard, found["majority"])),
-        "share": ("hazard's share of the latent's variance", gates.share),
-        "rank": ("effective rank", gates.rank),
-    }
-    failed = [
-        f"{words} {found[name]:.3f} is {limit - found[name]:.3f} short of {limit:.3f}"
-        for name, (words, limit) in limits.items()
-        if not found[name] >= limit
-    ]
-    if failed:
-        raise GateError("not frozen: " + "; ".join(failed))
+    require(
+        found,
+        {
+            "hazard": ("hazard-visible probe in unseen cells", max(gates.hazard, found["majority"])),
+            "share": ("hazard's share of the latent's variance", gates.share),
+            "rank": ("effective rank", gates.rank),
+        },
+    )

@@ -1,11 +1,10 @@
 """Stage 1 in the gridworld: the encoder of egocentric patches and its training (Section Encoder and freeze).
 
-The objective is the pixel encoder's (`perception.jepa`); what differs is what is encoded, a patch of 15 x 15 cell
+The objective is the pixel encoder's (`perception.objective`); what differs is what is encoded, a patch of 15 x 15 cell
 codes, and what the auxiliary read-out reconstructs, the code of every cell.
 """
 
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +16,8 @@ from torch.nn import functional as F
 from lt_lib.envs.gridworld import CODES, MOVES, PATCH, Grid
 from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.params import PatchEncoderConfig
-from lt_lib.perception.encoder import LATENT, Predictor
-from lt_lib.perception.jepa import Losses, class_weights, covariance_loss, variance_loss
+from lt_lib.perception.encoder import LATENT, Frozen
+from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 
 SHARES = 1_000  # walks whose views tell how common each code is
 
@@ -39,37 +38,6 @@ class PatchEncoder(nn.Module):
 
     def forward(self, patches: UInt8[Tensor, "b h w"]) -> Float[Tensor, "b 64"]:
         return self.layers(F.one_hot(patches.long(), len(CODES)).permute(0, 3, 1, 2).float())
-
-
-class PatchJepa(nn.Module):
-    """E, P, the target copy of E and the auxiliary read-out, which is discarded at the freeze."""
-
-    def __init__(self, weights: Float[Tensor, " codes"]):
-        super().__init__()
-        self.encoder, self.predictor = PatchEncoder(), Predictor()
-        self.target = deepcopy(self.encoder).requires_grad_(False)
-        self.readout = nn.Linear(LATENT, len(weights) * PATCH * PATCH)
-        self.register_buffer("class_weights", weights)
-
-    def losses(
-        self,
-        patches: UInt8[Tensor, "u h w"],
-        now: Int[Tensor, " b"],
-        moves: Float[Tensor, "b 3"],
-        following: Int[Tensor, " b"],
-    ) -> Losses:
-        """Of steps between rows of a table of patches; every patch is encoded once, however many steps it is in."""
-        latents = self.encoder(patches)
-        with torch.no_grad():
-            goals = self.target(patches)
-        latent, codes = latents[now], patches[now].long()
-        logits = self.readout(latent).view(len(latent), -1, PATCH, PATCH)
-        return Losses(
-            F.mse_loss(self.predictor(latent, moves), goals[following]),
-            variance_loss(latent),
-            covariance_loss(latent),
-            F.cross_entropy(logits, codes, weight=self.class_weights),
-        )
 
 
 class Walk(NamedTuple):
@@ -105,43 +73,17 @@ def train_patch_encoder(config: PatchEncoderConfig, seed: int, *, report: Callab
     patches = torch.from_numpy(table)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = PatchJepa(class_weights(table[rows[:SHARES]].astype(int), len(CODES)))
-    curves = _fit(model, patches, rows, walk.actions, config, rng, report)
+        model = Jepa(PatchEncoder(), class_weights(table[rows[:SHARES]].astype(int), len(CODES)), PATCH)
+
+    def losses(r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Losses:
+        now, following = rows[r, t], rows[r, t + 1]
+        latents, goals = model.encoder(patches), model.goal(patches)  # each once, however many steps it is in
+        return model.losses(latents[now], displacement(walk.actions[r, t]), goals[following], patches[now].long())
+
+    curves = fit(model, losses, rows.shape, config, rng, report)
     with torch.no_grad():
-        latents = model.encoder(patches).double()[torch.from_numpy(rows.ravel())]
-    mean, std = latents.mean(0).float().numpy(), (latents.std(0) + 1e-6).float().numpy()
-    weights = {
-        f"{p}.{k}": v.numpy()
-        for p, m in (("E", model.encoder), ("P", model.predictor))
-        for k, v in m.state_dict().items()
-    }
-    return weights | {"mean": mean, "std": std} | curves
-
-
-def _fit(model: PatchJepa, patches, rows, actions, config: PatchEncoderConfig, rng, report) -> dict:
-    pairs = np.argwhere(np.ones((rows.shape[0], rows.shape[1] - 1), bool))
-    updates = int(config.epochs * len(pairs) / config.batch)
-    curves = np.zeros((updates, len(Losses._fields)), np.float32)
-    if updates:
-        optimiser = torch.optim.Adam(model.parameters(), lr=config.lr)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.lr, total_steps=updates + 1)
-        scale = torch.tensor([config.prediction, config.variance, config.covariance, config.reconstruction])
-        order = np.concatenate([rng.permutation(pairs) for _ in range(int(np.ceil(config.epochs)))])
-    for update in range(updates):
-        r, t = order[update * config.batch : (update + 1) * config.batch].T
-        now, following = torch.from_numpy(rows[r, t]), torch.from_numpy(rows[r, t + 1])
-        losses = model.losses(patches, now, displacement(actions[r, t]), following)
-        stacked = torch.stack(losses)
-        optimiser.zero_grad()
-        (scale * stacked).sum().backward()
-        optimiser.step()
-        schedule.step()
-        with torch.no_grad():
-            for slow, fast in zip(model.target.parameters(), model.encoder.parameters(), strict=True):
-                slow.lerp_(fast, 1 - config.ema)
-        curves[update] = stacked.detach()
-        report((update + 1) / updates)
-    return {f"loss.{name}": curves[:, i].copy() for i, name in enumerate(Losses._fields)}
+        latents = model.encoder(patches).numpy()
+    return frozen(model, latents[rows.ravel()]) | curves
 
 
 def displacement(actions: Int[np.ndarray, " b"]) -> Float[Tensor, "b 3"]:
@@ -149,26 +91,11 @@ def displacement(actions: Int[np.ndarray, " b"]) -> Float[Tensor, "b 3"]:
     return F.pad(torch.from_numpy(MOVES[actions]).float(), (0, 1))
 
 
-class FrozenPatchEncoder:
-    """E and P after the freeze; the same two methods as `perception.encoder.FrozenEncoder`, for patches.
-
-    Built from a flat mapping of arrays ("E.*", "P.*", "mean", "std").
-    """
+class FrozenPatchEncoder(Frozen):
+    """For patches (B, 15, 15) of cell codes, on the CPU in float32."""
 
     def __init__(self, weights: Mapping[str, np.ndarray]):
-        self._encoder, self._predictor = PatchEncoder(), Predictor()
-        for module, prefix in ((self._encoder, "E."), (self._predictor, "P.")):
-            module.load_state_dict(
-                {k.removeprefix(prefix): torch.tensor(v) for k, v in weights.items() if k.startswith(prefix)}
-            )
-            module.requires_grad_(False)
-        self._mean, self._std = torch.tensor(weights["mean"]), torch.tensor(weights["std"])
+        super().__init__(PatchEncoder(), weights, "cpu", "float32")
 
-    def latent(self, patches: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b 64"]:
-        """Normalised latents of patches."""
-        return (self._encoder(torch.from_numpy(patches)) - self._mean) / self._std
-
-    def predicted(self, patches: UInt8[np.ndarray, "b h w"], move: Float[Tensor, "b 3"]) -> Float[Tensor, "b 64"]:
-        """Normalised latents that P predicts for the next patch under a move (cells)."""
-        raw = self._predictor(self._encoder(torch.from_numpy(patches)), move)
-        return (raw - self._mean) / self._std
+    def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> UInt8[Tensor, "b h w"]:
+        return torch.from_numpy(observations)
