@@ -4,7 +4,7 @@ import ast
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -28,6 +28,13 @@ ROOT = Path(__file__).resolve().parents[1]
 
 class UserError(Exception):
     """A mistake in what a person gave us; its one line names it and says what would be right."""
+
+
+def require_known(names: Iterable[str], known: Collection[str], what: str, where: str = "") -> None:
+    """Raises UserError for the first of the names of some `what` that is not a known one; `where`: 'seeds: '."""
+    for name in names:
+        if name not in known:
+            raise UserError(f"{where}unknown {what} '{name}'; there are {', '.join(known)}")
 
 
 def _frozen(value: Any) -> Any:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lt_lib.params import ROOT, GridworldConfig, UserError
+from lt_lib.params import ROOT, GridworldConfig, require_known
 
 KINDS = ("encoder", "executor")  # what a weights folder holds
 
@@ -39,10 +39,7 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
         from lt_lib.comm.messages import CONDITIONS
         from lt_lib.learners.redraw import REDRAWS
 
-        known = (*CONDITIONS, *REDRAWS)
-        unknown = sorted(set(parameters["seeds"]) - set(known))
-        if unknown:
-            raise UserError(f"seeds: unknown message condition '{unknown[0]}'; there are {', '.join(known)}")
+        require_known(parameters["seeds"], (*CONDITIONS, *REDRAWS), "message condition", "seeds: ")
     if "effects" in parameters:
         _check_hardware(parameters, root)
     if "gridworld" in parameters:
@@ -62,9 +59,7 @@ def _check_hardware(parameters: Mapping[str, Any], root: Path) -> None:
     from lt_lib.perception.sessions import EFFECTS
     from lt_lib.report.registration import read_gates
 
-    unknown = sorted(set(parameters["effects"]) - set(EFFECTS))
-    if unknown:
-        raise UserError(f"effects: unknown camera effect '{unknown[0]}'; there are {', '.join(EFFECTS)}")
+    require_known(parameters["effects"], EFFECTS, "camera effect", "effects: ")
     read_gates(root / parameters["gate_file"])
     if parameters["frames"]:
         read_sessions(root / parameters["frames"])
@@ -80,8 +75,4 @@ def _check_gridworld(parameters: Mapping[str, Any]) -> None:
     require_occluded_choices(Grid(load_layout(gridworld.layout)))
     if "peek_layout" in parameters:
         Grid(load_layout(parameters["peek_layout"]))
-    unknown = sorted(set(gridworld.seeds) - set(GRID_CONTENTS))
-    if unknown:
-        raise UserError(
-            f"gridworld.seeds: unknown message content '{unknown[0]}'; there are {', '.join(GRID_CONTENTS)}"
-        )
+    require_known(gridworld.seeds, GRID_CONTENTS, "message content", "gridworld.seeds: ")

@@ -38,7 +38,7 @@ Packed = tuple[bytes, float]  # a packed result and the seconds it took
 Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run, given with its key
 
 # What a result may change with besides our own code.
-LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn")
+LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn", "opencv-python-headless")
 ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",

@@ -9,7 +9,7 @@ from lt_lib.comm.channel import anchor
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.envs.gridworld import CODES, Grid
 from lt_lib.envs.layout import SIDES
-from lt_lib.params import UserError
+from lt_lib.params import require_known
 from lt_lib.perception.patches import FrozenPatchEncoder
 
 
@@ -23,8 +23,7 @@ GRID_CONTENTS = CONTENTS | {"raw": raw}
 
 def contents_sent(grid: Grid, encoder: FrozenPatchEncoder, content: str) -> Float[Tensor, "m slab c"]:
     """What a scout at each of its m posts sends under either placement. Raises UserError for an unknown content."""
-    if content not in GRID_CONTENTS:
-        raise UserError(f"unknown message content '{content}'; known: {', '.join(GRID_CONTENTS)}")
+    require_known([content], GRID_CONTENTS, "message content")
     post, slab = (values.ravel() for values in np.indices((len(grid.posts), len(SIDES))))
     pose = np.pad(grid.centres[grid.posts[post]], ((0, 0), (0, 1)))  # a scout on cells has no heading
     still = np.zeros((len(post), 2))

@@ -78,8 +78,7 @@ class Arena:
     def _observe(self):
         x, y = self._qpos[:, 0], self._qpos[:, 1]
         left, right = self.layout.routes
-        gap = np.where(self.slab == 0, left.slab.distance(x, y), right.slab.distance(x, y))
-        self.contact = gap < self.layout.robot.radius + CONTACT
+        self.contact = self.layout.slab_distance(self.slab, x, y) < self.layout.robot.radius + CONTACT
         self.reached = np.hypot(x - self.layout.goal.x, y - self.layout.goal.y) < self.layout.goal.radius
         self.corridor = np.where(left.contains(x, y), 0, np.where(right.contains(x, y), 1, NO_CORRIDOR))
 

@@ -162,6 +162,11 @@ class Layout(Settings):
         """The hazard slab in the left (0) or right (1) corridor."""
         return Box(self.routes[side].slab.bounds, self.slab_height, "slab")
 
+    def slab_distance(self, side, x, y):
+        """Metres from points to the slab in the left (0) or right (1) corridor; broadcasts."""
+        left, right = (route.slab.distance(x, y) for route in self.routes)
+        return np.where(side == 0, left, right)
+
     def free(self, x, y, clearance: float = 0.0):
         """Whether a disc of radius `clearance` (metres) at the points touches no wall; broadcasts."""
         clear = [Rect(x=b.bounds[:2], y=b.bounds[2:]).distance(x, y) > clearance for b in self.walls]

@@ -15,7 +15,7 @@ from lt_lib.params import (
     PatchEncoderConfig,
     PatchGateConfig,
     PatchGates,
-    UserError,
+    require_known,
 )  # fmt: skip
 from lt_lib.perception.patch_gates import measure_patch_gates, require_patch_gates
 from lt_lib.perception.patches import train_patch_encoder
@@ -75,9 +75,7 @@ class GridProtocol:
 
     def trained(self, seeds: Mapping[str, int], encoder: Result) -> dict[str, list[Result]]:
         """Stage 2: so many seeds of each content, all with the same settings. Raises UserError for an unknown one."""
-        for content in seeds:
-            if content not in GRID_CONTENTS:
-                raise UserError(f"unknown message content '{content}'; known: {', '.join(GRID_CONTENTS)}")
+        require_known(seeds, GRID_CONTENTS, "message content")
         return self._fetch({content: (content, count, encoder) for content, count in seeds.items()})
 
     def ablated(self, encoders: Mapping[str, Result], seeds: int) -> dict[str, list[Result]]:

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from lt_lib.params import PpoConfig
@@ -29,7 +29,7 @@ class Policy(Protocol):
 class Batch(NamedTuple):
     """What was sampled, flattened to B steps."""
 
-    observations: Float[Tensor, "b d"]
+    observations: Shaped[Tensor, "b d"]  # floats, or the gridworld's rows of tables
     actions: Tensor  # (B,) categorical or (B, A) continuous
     log_probs: Float[Tensor, " b"]
     advantages: Float[Tensor, " b"]

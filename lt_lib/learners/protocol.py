@@ -28,7 +28,7 @@ from lt_lib.params import (
     HeadConfig,
     RedrawConfig,
     Training,
-    UserError,
+    require_known,
 )  # fmt: skip
 from lt_lib.perception.gates import Measured, measure_gates, require_gates
 from lt_lib.perception.jepa import train_encoder
@@ -180,8 +180,7 @@ class Protocol:
         return dict(zip(CORRUPTIONS, self.store.fetch(runs, f"corruption of {name}"), strict=True))
 
     def _head(self, name: str) -> HeadConfig:
-        if name not in CONDITIONS:
-            raise UserError(f"unknown message condition '{name}'; known: {', '.join(CONDITIONS)}")
+        require_known([name], CONDITIONS, "message condition")
         condition = CONDITIONS[name]
         return self.head.model_copy(update={"content": condition.content, "wire": condition.wire})
 

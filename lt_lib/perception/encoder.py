@@ -77,12 +77,12 @@ class Frozen:
         """Observations as E takes them."""
         raise NotImplementedError
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def latent(self, observations: UInt8[np.ndarray, "b ..."]) -> Float[Tensor, "b 64"]:
         """Normalised latents."""
         return self._normalised(self._encoder(self.inputs(observations)))
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def predicted(
         self, observations: UInt8[np.ndarray, "b ..."], action: Float[Tensor, "b 3"]
     ) -> Float[Tensor, "b 64"]:

@@ -55,8 +55,7 @@ def free_poses(
     while missing.any():
         xy = rng.uniform(low, high, (n, 2))
         x, y = xy.T
-        gap = np.where(slab == 0, layout.routes[0].slab.distance(x, y), layout.routes[1].slab.distance(x, y))
-        good = layout.free(x, y, radius) & (gap > radius)
+        good = layout.free(x, y, radius) & (layout.slab_distance(slab, x, y) > radius)
         if apart_from is not None:
             good &= np.hypot(*(xy - apart_from[:, :2]).T) > 2 * radius
         take = missing & good

@@ -10,7 +10,7 @@ from lt_lib.envs import optics
 from lt_lib.envs.bench import Placements, draw_placements, simulated_frames
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.surrogate import SurrogateScene
-from lt_lib.params import MatchedEncoderConfig, SessionConfig, SweepConfig, UserError
+from lt_lib.params import MatchedEncoderConfig, OpticsConfig, SessionConfig, SweepConfig, require_known
 from lt_lib.perception.randomise import draw_appearances, eight_bits, recoloured
 
 
@@ -78,12 +78,13 @@ def film_sweep(config: SweepConfig, seed: int, *, report: Callable[[float], None
 
 def with_effect(config: SessionConfig, effect: str, strength: float) -> SessionConfig:
     """The session with one field of its camera or its bench changed. Raises UserError for an unknown effect."""
-    for part in ("optics", "bench"):
-        fields = type(getattr(config, part)).model_fields
-        if effect in fields:
-            value = fields[effect].annotation(strength)  # whole numbers and switches, as the field has them
-            return config.model_copy(update={part: getattr(config, part).model_copy(update={effect: value})})
-    raise UserError(f"unknown effect '{effect}'; there are {', '.join(EFFECTS)}")
+    require_known([effect], EFFECTS, "effect")
+    part = "optics" if effect in OpticsConfig.model_fields else "bench"
+    ordinary = getattr(config, part)
+    value = (
+        type(ordinary).model_fields[effect].annotation(strength)
+    )  # whole numbers and switches, as the field has them
+    return config.model_copy(update={part: ordinary.model_copy(update={effect: value})})
 
 
 def _pictures(config: SessionConfig, placements: Placements, report) -> list[UInt8[np.ndarray, "h w 3"]]:
