@@ -127,6 +127,17 @@ def test_a_scene_does_not_depend_on_what_is_stepped_beside_it(layout):
         np.testing.assert_array_equal(alone.pose[0], many.pose[20])
 
 
+def test_scenes_that_are_not_live_stand_still_and_the_others_go_on_as_ever(layout):
+    some, every = start(layout, 16), start(layout, 16)
+    live, first = np.arange(16) % 3 > 0, some.pose
+    for action in np.random.default_rng(3).uniform(-1, 1, (30, 16, 3)):
+        some.step(action, live)
+        every.step(action)
+    np.testing.assert_array_equal(some.pose[~live], first[~live])
+    np.testing.assert_array_equal(some.pose[live], every.pose[live])
+    assert (every.pose[~live] != first[~live]).any(axis=1).all()
+
+
 def test_reset_forgets_the_episode_before_and_touches_no_other_scene(layout):
     begin = np.array([[0.76, 0.56, 0.3], [-3.0, 1.0, 0.0]])  # the first starts in a corner of slab and wall
     scout, action = np.tile(layout.scout.array, (2, 1)), np.ones((2, 3))
