@@ -1,6 +1,5 @@
 """How well the fast camera agrees with `mujoco.Renderer`, and how much faster it is (Section Setup's camera)."""
 
-import time
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +8,7 @@ from jaxtyping import Float
 from lt_lib.envs.camera import FastCamera, colours, network_input
 from lt_lib.envs.materials import HAZARD
 from lt_lib.envs.reference import ReferenceCamera
+from lt_lib.timing import taking_turns
 
 BATCH, SLOW_BATCH = 256, 32  # frames a turn: what a training asks for at a time, and fewer of the slow ones
 
@@ -57,11 +57,5 @@ def frame_rates(
         "fast camera": (BATCH, lambda: fast.frames(*scenes)),
         "fast camera, expanded to the network's input": (BATCH, lambda: network_input(fast.frames(*scenes))),
     }
-    seconds = {name: [] for name in draws}
-    for turn in range(rounds + 1):
-        for name, (_, draw) in draws.items():
-            start = time.process_time()
-            draw()
-            if turn:  # the first round compiles and warms up
-                seconds[name].append(time.process_time() - start)
-    return {name: frames / float(np.median(seconds[name])) for name, (frames, _) in draws.items()}
+    seconds = taking_turns({name: draw for name, (_, draw) in draws.items()}, rounds)
+    return {name: frames / seconds[name] for name, (frames, _) in draws.items()}

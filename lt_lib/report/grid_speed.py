@@ -1,7 +1,6 @@
 """What the tables buy in the gridworld: the same training, sample by sample and by tables, side by side on one core."""
 
-import time
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -18,6 +17,7 @@ from lt_lib.learners.mappo import Inputs, TableTeam, Team, batch
 from lt_lib.params import GridConfig
 from lt_lib.perception.patches import FrozenPatchEncoder
 from lt_lib.runs import Result
+from lt_lib.timing import taking_turns
 
 
 def rates(config: GridConfig, encoder: Result, rounds: int = 2) -> pd.DataFrame:
@@ -29,28 +29,17 @@ def rates(config: GridConfig, encoder: Result, rounds: int = 2) -> pd.DataFrame:
     """
     grid, frozen = Grid(load_layout(config.layout)), FrozenPatchEncoder(encoder)
     inputs = Inputs.of(grid, frozen, config.content)
-    rows = {
+    learners = {
         "plain loop": _Plain(grid, frozen, Team(inputs), config),
         "tables": _Tables(grid, TableTeam(inputs), config),
     }
-    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in rows}
-    for turn in range(rounds + 1):
-        for name, learner in rows.items():
-            walked, sampled = _clocked(learner.sample)
-            improved, _ = _clocked(lambda learner=learner, sampled=sampled: learner.improve(sampled))
-            if turn:  # the first round compiles and warms up
-                seconds[name].append((walked, improved))
-    table = pd.DataFrame(
-        {name: np.median(values, axis=0) for name, values in seconds.items()}, index=["rollout (s)", "update (s)"]
-    )
+    calls = {}
+    for name, learner in learners.items():
+        calls[name, "rollout (s)"] = learner.sample
+        calls[name, "update (s)"] = partial(learner.improve, learner.sample())
+    table = pd.Series(taking_turns(calls, rounds)).unstack(0)[list(learners)]
     table.loc["steps/s, learning included"] = config.envs * config.rollout / table.sum()
     return table
-
-
-def _clocked(call: Callable):
-    start = time.process_time()
-    result = call()
-    return time.process_time() - start, result
 
 
 class _Learner:

@@ -1,7 +1,5 @@
 """What one control step costs, stage by stage, with the fast camera and with `mujoco.Renderer`, side by side."""
 
-import time
-
 import numpy as np
 import pandas as pd
 
@@ -13,6 +11,7 @@ from lt_lib.learners.episodes import draw_scenes
 from lt_lib.learners.executor import FrozenExecutor
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.runs import Result
+from lt_lib.timing import taking_turns
 
 ENVS = 64  # scenes stepped side by side, as in training
 
@@ -26,16 +25,18 @@ def step_costs(layout: Layout, encoder: Result, executor: Result, rounds: int = 
     fast, reference, rng = FastCamera(layout), ReferenceCamera(layout), np.random.default_rng(0)
     draws, route = draw_scenes(layout, ENVS, rng), rng.integers(0, 2, ENVS)
     arena.reset(np.ones(ENVS, bool), draws.spawn, rng.integers(0, 2, ENVS), draws.scout)
-    seconds: dict[str, list[float]] = {}
-    for turn in range(rounds + 1):
-        view = (arena.pose, arena.slab, arena.scout[:, :2])
-        frames = _timed(seconds, "camera", turn, lambda view=view: fast.frames(*view))
-        _timed(seconds, "mujoco.Renderer", turn, lambda view=view: reference.pictures(*view))
-        latent = _timed(seconds, "encoder", turn, lambda frames=frames: frozen.latent(frames))
-        action = _timed(seconds, "policy", turn, lambda latent=latent: driver.mean_action(latent, route))
-        _timed(seconds, "physics", turn, lambda action=action: arena.step(action))
+    frames = fast.frames(arena.pose, arena.slab, arena.scout[:, :2])
+    latent = frozen.latent(frames)
+    action = driver.mean_action(latent, route)
+    stages = {
+        "camera": lambda: fast.frames(arena.pose, arena.slab, arena.scout[:, :2]),
+        "mujoco.Renderer": lambda: reference.pictures(arena.pose, arena.slab, arena.scout[:, :2]),
+        "encoder": lambda: frozen.latent(frames),
+        "policy": lambda: driver.mean_action(latent, route),
+        "physics": lambda: arena.step(action),
+    }
+    cost = {stage: seconds / ENVS * 1e6 for stage, seconds in taking_turns(stages, rounds).items()}
     reference.close()
-    cost = {stage: np.median(values) / ENVS * 1e6 for stage, values in seconds.items()}
     shared = {stage: cost[stage] for stage in ("physics", "encoder", "policy")}
     table = pd.DataFrame({
         "fast camera": {"camera": cost["camera"], **shared},
@@ -43,11 +44,3 @@ def step_costs(layout: Layout, encoder: Result, executor: Result, rounds: int = 
     })  # fmt: skip
     table.loc["whole step"] = table.sum()
     return table
-
-
-def _timed(seconds: dict[str, list[float]], stage: str, turn: int, call):
-    start = time.process_time()
-    result = call()
-    if turn:  # the first round warms up
-        seconds.setdefault(stage, []).append(time.process_time() - start)
-    return result
