@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pandas as pd
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -29,19 +28,6 @@ COLOURS = {
 }
 CELLS = ListedColormap([colour for _, colour in COLOURS.values()])
 UNTOLD = ("floor", "position", "trajectory")  # contents that cannot say where the slab is
-GATES = {
-    "hazard": "hazard-visible probe, unseen cells",
-    "majority": "majority baseline",
-    "share": "hazard's share of variance",
-    "rank": "effective rank",
-}
-
-
-def gate_table(reports: Mapping[str, Result], thresholds: Mapping[str, float]) -> pd.DataFrame:
-    """Gates down, encoders across, with the pre-registered thresholds."""
-    columns = {name: {words: report[key] for key, words in GATES.items()} for name, report in reports.items()}
-    columns["must reach"] = {GATES[key]: value for key, value in thresholds.items()}
-    return pd.DataFrame(columns).loc[list(GATES.values())].round(3)
 
 
 def board(axes: Axes, grid: Grid, slab: int) -> None:

@@ -45,13 +45,6 @@ def some(session: Session, dim: bool | None = None, n: int = ACROSS) -> UInt8[np
     return session.frames[np.concatenate([hazard, clear])]
 
 
-def gate_table(reports: Mapping[str, Mapping[str, float]], limits: Mapping[str, float]) -> pd.DataFrame:
-    """Encoders down, gates across, with the registered thresholds."""
-    names = {"hazard": "hazard-visible probe", "walls": "wall-count R²", "rank": "effective rank"}
-    rows = dict(reports) | {"must reach": limits}
-    return pd.DataFrame({name: {names[key]: each[key] for key in names} for name, each in rows.items()}).T.round(3)
-
-
 def shift_table(transfers: Mapping[str, Transfer], simulated_again: Mapping[str, Float[np.ndarray, "n d"]]):
     """Frechet distance of latents from the simulated bench, a row an encoder; the first column is what chance gives."""
     table = {}

@@ -14,21 +14,6 @@ from lt_lib.perception.jepa import GRID, colour_classes
 from lt_lib.report.style import ROLES
 from lt_lib.runs import Result
 
-GATES = {
-    "hazard": "hazard-visible probe",
-    "majority": "majority baseline",
-    "walls": "wall-count R²",
-    "rank": "effective rank",
-    "rank_eigen": "(by eigenvalues)",
-}
-
-
-def gate_table(reports: Mapping[str, Result], thresholds: Mapping[str, float]) -> pd.DataFrame:
-    """Gates down, encoders across, with the pre-registered thresholds."""
-    columns = {name: {words: report[key] for key, words in GATES.items()} for name, report in reports.items()}
-    columns["must reach"] = {GATES[key]: value for key, value in thresholds.items()}
-    return pd.DataFrame(columns).loc[list(GATES.values())].round(3)
-
 
 def training_frames(frames: UInt8[np.ndarray, "n h w"]) -> Figure:
     """Frames of random rollouts above, and below what the read-out is asked for: quantised colours on a coarse grid."""
