@@ -31,7 +31,7 @@ def rows_of_pictures(rows: Mapping[str, UInt8[np.ndarray, "n h w 3"]]) -> Figure
         for axes, picture in zip_longest(line, pictures):
             axes.set(xticks=[], yticks=[], frame_on=picture is not None)
             if picture is not None:
-                axes.imshow(picture)
+                axes.imshow(picture, interpolation="nearest")  # pixels as the encoder gets them
         line[0].set_ylabel(name, fontsize=8)
     return figure
 
