@@ -6,6 +6,8 @@ import io
 import itertools
 import json
 import math
+import re
+from fnmatch import fnmatch
 
 import numpy as np
 import pytest
@@ -405,6 +407,17 @@ def alter(path, change):
     content.pop("sha256")
     change(content)
     path.write_text(json.dumps(content))
+
+
+def test_every_deviation_on_the_committed_board_is_discussed_in_its_notebook():
+    rows = csv.DictReader((ROOT / "outputs" / "full" / "scoreboard.csv").open(encoding="utf-8"))
+    deviating = [row for row in rows if row["verdict"] in ("same direction", "not reproduced")]
+    assert deviating
+    for row in deviating:
+        source = json.loads((ROOT / "notebooks" / f"{row['notebook']}.ipynb").read_text(encoding="utf-8"))
+        prose = "".join("".join(cell["source"]) for cell in source["cells"] if cell["cell_type"] == "markdown")
+        named = re.findall(r"`([a-z]+\.[\w.*]+)`", prose)
+        assert any(fnmatch(row["id"], pattern) for pattern in named), f"{row['notebook']} says nothing of {row['id']}"
 
 
 def test_an_id_in_two_files_is_an_error(tmp_path, few):
