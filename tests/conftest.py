@@ -15,7 +15,8 @@ import lt_lib.envs.raycast  # compiled code, imported before the checks so that 
 import lt_lib.envs.windows
 import lt_lib.learners.grid_walks
 import lt_lib.learners.table_ppo
-import lt_lib.perception.recolour  # noqa: F401
+import lt_lib.perception.recolour
+import lt_lib.perception.renewal  # noqa: F401
 
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")
 

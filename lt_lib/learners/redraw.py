@@ -24,6 +24,7 @@ from lt_lib.learners.episodes import ARRIVAL_REWARD, CONTACT_REWARD, SLABS, Draw
 from lt_lib.learners.executor import FrozenExecutor
 from lt_lib.params import PpoConfig, RedrawConfig
 from lt_lib.perception.encoder import FrozenEncoder, best_device
+from lt_lib.perception.renewal import renew
 
 
 class Redraw(NamedTuple):
@@ -61,22 +62,23 @@ class FrameMemory:
     """The last frame of every row and what was made of it, which is made anew only where the frame has changed."""
 
     def __init__(self, rows: int, pixels: int):
-        self._frames = np.full((rows, pixels, pixels), UNSEEN, np.uint8)
+        self._frames = np.full((rows, pixels * pixels), UNSEEN, np.uint8).view(np.uint64)
         self.made: Tensor | None = None  # (rows, width), zeros for a row that showed nothing yet
 
     def forget(self, which: Bool[np.ndarray, " n"]):
-        self._frames[which] = UNSEEN
+        self._frames.view(np.uint8)[which] = UNSEEN
 
     def recall(self, rows: Int[np.ndarray, " b"], frames, make: Callable) -> Float[Tensor, "b width"]:
         """What was made of the frames (B, H, W) of some rows; `make` takes positions in `rows`, BLOCK or a multiple."""
-        new = np.flatnonzero((frames != self._frames[rows]).any(axis=(1, 2)))
+        changed = np.empty(len(rows), bool)
+        renew(self._frames, rows, frames.reshape(len(rows), -1).view(np.uint64), changed)
+        new = np.flatnonzero(changed)
         if len(new):
             whole_blocks = np.resize(new, -(-len(new) // BLOCK) * BLOCK)
             made = make(whole_blocks)
             if self.made is None:
                 self.made = made.new_zeros(len(self._frames), made.shape[1])
             self.made[rows[new]] = made[: len(new)]
-            self._frames[rows[new]] = frames[new]
         return self.made[rows]
 
 

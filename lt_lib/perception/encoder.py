@@ -7,10 +7,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from lt_lib.envs.camera import network_input
+from lt_lib.envs.camera import looked_up
+from lt_lib.envs.materials import PALETTE
 
 LATENT = 64
 ACTION = 3
+BITS = {torch.float32: torch.int32, torch.bfloat16: torch.int16}
 CHUNK = 1024  # observations encoded at once where there are many
 
 
@@ -21,11 +23,11 @@ class Encoder(nn.Module):
         super().__init__()
         self.layers = nn.Sequential(
             nn.Conv2d(3, 32, kernel_size=8, stride=4),
-            nn.ReLU(),  # (B, 32, 15, 15)
+            nn.ReLU(inplace=True),  # (B, 32, 15, 15)
             nn.Conv2d(32, 64, kernel_size=4, stride=2),
-            nn.ReLU(),  # (B, 64, 6, 6)
+            nn.ReLU(inplace=True),  # (B, 64, 6, 6)
             nn.Conv2d(64, 64, kernel_size=3, stride=1),
-            nn.ReLU(),  # (B, 64, 4, 4)
+            nn.ReLU(inplace=True),  # (B, 64, 4, 4)
             nn.Flatten(),
             nn.Linear(1024, LATENT),
         ).to(memory_format=torch.channels_last)
@@ -102,9 +104,11 @@ class FrozenEncoder(Frozen):
 
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu", precision: str = "float32"):
         super().__init__(Encoder(), weights, device, precision)
+        scaled = torch.from_numpy(PALETTE.astype(np.float32) / np.float32(255)).to(self.dtype)
+        self._table = scaled.view(BITS[self.dtype]).numpy()  # numpy has no bfloat16
 
     def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b h w 3"]:
-        return torch.from_numpy(network_input(observations)).to(self.device, self.dtype)
+        return torch.from_numpy(looked_up(observations, self._table)).view(self.dtype).to(self.device)
 
 
 def in_chunks(encode: Callable[[np.ndarray], Tensor], observations: np.ndarray) -> Float[np.ndarray, "n 64"]:
