@@ -25,17 +25,19 @@ from typing import Any
 import joblib
 import numpy as np
 import safetensors.numpy
-from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky import get_reusable_executor
 
 from lt_lib.files import writable_folder, write_atomically
 from lt_lib.params import Settings
 from lt_lib.progress import Reporter, stage, write_fraction
-from lt_lib.sources import source_digest
+from lt_lib.sources import source_digest, source_state
 
 Result = dict[str, Any]
 
 Packed = tuple[bytes, float]  # a packed result and the seconds it took
 Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run, given with its key
+
+IDLE_S = 60  # after which a worker without a run ends
 
 # What a result may change with besides our own code.
 LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn", "opencv-python-headless")
@@ -136,7 +138,7 @@ class RunStore:
         failures = []
         with (
             stage(self.folder, what, len(missing)) as (progress, finished),
-            self._start(len(missing), progress) as submit,
+            self._start(missing, progress) as submit,
         ):
             futures = {submit(key, run): key for key, run in missing.items()}
             for future in as_completed(futures):
@@ -149,13 +151,14 @@ class RunStore:
             reason = f"{type(error).__name__}: {error}"
             raise RunError(f"{len(failures)} of {len(missing)} runs failed, first {run}: {reason}") from error
 
-    def _start(self, wanted: int, progress: Path) -> AbstractContextManager[Submit]:
-        """The workers for so many runs, whose progress goes into a folder."""
+    def _start(self, missing: Mapping[str, Run], progress: Path) -> AbstractContextManager[Submit]:
+        """The workers for some runs, whose progress goes into a folder."""
         if isinstance(self.workers, str):
             from lt_lib.cluster import cluster_workers  # here, since Dask takes a second to import
 
             return cluster_workers(self.workers, progress)
-        return _local_workers(min(self.workers or joblib.cpu_count(), wanted), progress)
+        source = "".join(sorted({source_state(run.function) for run in missing.values()}))
+        return _local_workers(min(self.workers or joblib.cpu_count(), len(missing)), source, progress)
 
     def _end(self, key: str, run: Run, future: "Future[Packed]") -> BaseException | None:
         """Keeps the result of a run that ended; what went wrong if it has none or cannot be kept."""
@@ -192,20 +195,24 @@ def compute(run: Run, tell: Callable[[float], None]) -> Packed:
 
 
 @contextlib.contextmanager
-def _local_workers(processes: int, progress: Path) -> Iterator[Submit]:
-    """Worker processes of one thread each, which end with the block or with this process, however it ends.
+def _local_workers(processes: int, source: str, progress: Path) -> Iterator[Submit]:
+    """Worker processes of one thread each, which end with this process, however it ends, and if the block fails.
 
-    They start now, and so run the source that was digested.
+    They are kept for the next stage, since each takes seconds to start; not if they were started from another
+    `source`, because theirs must be the one that was digested.
     """
-    pool = ProcessPoolExecutor(processes, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(),))
+    pool = get_reusable_executor(
+        processes, timeout=IDLE_S, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(), source)
+    )
     try:
         yield lambda key, run: pool.submit(compute, run, partial(write_fraction, progress / f"{key}.json"))
-    finally:
+    except BaseException:
         pool.shutdown(wait=True, kill_workers=True)
+        raise
 
 
-def _end_with(parent: int) -> None:
-    """Lets this worker end soon after its parent, even after one that was killed."""
+def _end_with(parent: int, source: str) -> None:
+    """Lets this worker end soon after its parent, even after one that was killed; `source` tells it from others."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -2,6 +2,7 @@
 
 import ast
 import hashlib
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from importlib.util import resolve_name
@@ -26,6 +27,14 @@ def source_digest(function: Callable, *classes: type, folder: Path) -> str:
                 code[part], imports = _read(path, path.stat().st_mtime_ns, *part)
                 todo |= imports
     return hashlib.sha256(repr(sorted(code.items())).encode()).hexdigest()
+
+
+def source_state(function: Callable) -> str:
+    """Changes with any edit of the package, or of the folder, that a function is imported from."""
+    top = sys.modules[function.__module__.partition(".")[0]]
+    found = {path: path.stat() for path in sorted(Path(top.__file__).parent.rglob("*.py"))}
+    state = [(str(path), stat.st_mtime_ns, stat.st_size) for path, stat in found.items()]
+    return hashlib.sha256(repr(state).encode()).hexdigest()
 
 
 def _modules(folder: Path, name: str) -> Iterator[tuple[str, str, Path]]:

@@ -121,14 +121,17 @@ def bank_against_live(protocol: Protocol, bank: Result, encoder: Result, executo
 
 # --- workers
 def fan_out(config: PointMassConfig, runs: int, workers: Sequence[int]) -> dict[int, float]:
-    """Wall-clock seconds of the same runs from nothing, by the number of workers, their start included."""
-
-    def fetch(count: int) -> None:
+    """Wall-clock seconds of the same runs from nothing, by the number of workers, which have started before."""
+    several = [Run(train_point_mass, config, seed * config.seeds) for seed in range(runs + max(workers))]
+    seconds = {}
+    for count in workers:
         with TemporaryDirectory() as folder:
             store = RunStore(Path(folder), count)
-            store.fetch([Run(train_point_mass, config, seed * config.seeds) for seed in range(runs)], "timed runs")
-
-    return taking_turns({count: lambda count=count: fetch(count) for count in workers}, 1, time.perf_counter)
+            store.fetch(several[runs : runs + count], "workers start")
+            start = time.perf_counter()
+            store.fetch(several[:runs], "timed runs")
+            seconds[count] = time.perf_counter() - start
+    return seconds
 
 
 # --- growth

@@ -111,6 +111,6 @@ def film_pair(
     for name, wire in wires.items():
         route = int(read_head(heads[name][0]).policy(wire).probs[slab].argmax())
         take = record(layout, frozen, driver, draws, 0, slab, route, commit_step)
-        every = max(1, len(take.poses) // 60)
+        every = max(1, len(take.poses) // 40)
         paths.append(save_gif(folder / "figures" / f"04_{name}.gif", pictures(layout, take, every, f"message: {name}")))
     return paths

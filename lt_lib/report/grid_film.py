@@ -20,7 +20,7 @@ from lt_lib.report.scene import NAVIGATOR, SCOUT
 from lt_lib.report.style import ROLES
 from lt_lib.runs import Result
 
-LONGEST = 20  # pictures; a solved episode takes about 12
+LONGEST = 14  # pictures; a solved episode takes about 12
 ARROWS = ("stay", "right", "left", "up", "down")
 
 
