@@ -1,7 +1,9 @@
 """The run store: keys, checked files, workers, failures and progress."""
 
+import importlib
 import json
 import logging
+import os
 import subprocess
 import sys
 import time
@@ -201,6 +203,25 @@ def test_result_files_are_the_same_bytes_for_one_worker_and_two(tmp_path):
     files = kept_files(tmp_path / "1")
     assert len(files) == 4
     assert files == kept_files(tmp_path / "2")
+
+
+def test_workers_are_kept_from_stage_to_stage_until_the_source_is_edited(tmp_path, monkeypatch):
+    code = "import os\ndef train(config, seed, *, report): return {{'version': {}, 'worker': os.getpid()}}\n"
+    module = tmp_path / "edited_toy.py"
+    monkeypatch.syspath_prepend(tmp_path)
+    store = RunStore(tmp_path / "runs", 1)
+
+    def stage(version: int, seed: int) -> tuple[int, int]:
+        module.write_text(code.format(version))
+        os.utime(module, (version, version))  # the second write may fall into the first one's tick of the clock
+        importlib.invalidate_caches()
+        toy = importlib.import_module("edited_toy")
+        (result,) = store.fetch([Run(toy.train, ToyConfig(), seed)], "edited toy")
+        return result["version"], result["worker"]
+
+    (first, one), (again, same), (edited, other) = stage(1, 0), stage(1, 1), stage(2, 2)
+    assert (first, again, edited) == (1, 1, 2)
+    assert one == same != other
 
 
 @pytest.mark.parametrize("workers", [1, 2])
