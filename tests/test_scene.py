@@ -13,9 +13,10 @@ from lt_lib.envs.camera import FastCamera, colours, network_input
 from lt_lib.envs.fidelity import agreement
 from lt_lib.envs.geodesic import MARGIN, RESOLUTION, RouteDistance
 from lt_lib.envs.layout import Layout, load_layout
-from lt_lib.envs.materials import INDEX
+from lt_lib.envs.materials import HAZARD, INDEX
 from lt_lib.envs.occlusion import occlusion, require_occlusion, sight_map
 from lt_lib.envs.reference import ReferenceCamera
+from lt_lib.envs.warp_camera import WarpCamera
 from lt_lib.learners.episodes import draw_scenes, drive
 from lt_lib.learners.executor import FrozenExecutor
 from lt_lib.params import UserError, layout_path
@@ -84,6 +85,14 @@ def test_leaking_layout_loads_leaks_a_few_pixels_and_is_refused():
     assert np.nanmax(sight_map(leaking, 0, spacing=0.25).pixels) > 0
     with pytest.raises(UserError, match=r"^layout leaking: the navigator sees the left slab from choice_points\[0\]"):
         require_occlusion(leaking)
+
+
+def test_fast_camera_agrees_with_mujoco_warp(layout):
+    eyes, slabs, others = random_scenes(layout, 48, 5)
+    ours, theirs = FastCamera(layout).frames(eyes, slabs, others), WarpCamera(layout, 48).frames(eyes, slabs, others)
+    assert (ours == theirs).mean() > 0.999
+    np.testing.assert_array_equal(HAZARD[ours].any(axis=(1, 2)), HAZARD[theirs].any(axis=(1, 2)))
+    assert len(np.unique(theirs)) > 8
 
 
 # --- physics

@@ -22,8 +22,7 @@ class ReferenceCamera:
         self._data = mujoco.MjData(self.model)
         self._renderer = _renderer(self.model, self.pixels, self.pixels)
         self._options = _looking_at(SEEN, SCOUT)
-        materials = [name.split(":")[0] for name in _geom_names(self.model)]
-        self._index = np.array([INDEX.get(name, INDEX["sky"]) for name in materials] + [INDEX["sky"]], np.uint8)
+        self._index = palette_indices(self.model)
 
     def frames(
         self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
@@ -176,8 +175,11 @@ def _robot(layout: Layout, name: str, group: int, material: str, z: float = 0.0)
     )
 
 
-def _geom_names(model) -> list[str]:
-    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, i) or "" for i in range(model.ngeom)]
+def palette_indices(model: mujoco.MjModel) -> UInt8[np.ndarray, " entries"]:
+    """The palette index of each geom of a scene, and as the last entry the background's."""
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, i) or "" for i in range(model.ngeom)]
+    materials = [name.split(":")[0] for name in names]
+    return np.array([INDEX.get(name, INDEX["sky"]) for name in materials] + [INDEX["sky"]], np.uint8)
 
 
 def _looking_at(*groups: int) -> mujoco.MjvOption:

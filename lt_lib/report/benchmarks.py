@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import torch
+from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -117,6 +118,27 @@ def bank_against_live(protocol: Protocol, bank: Result, encoder: Result, executo
         seconds["head"],
         seconds["live"] * protocol.head.episodes / episodes,
     )
+
+
+# --- cameras
+class WarpCost(NamedTuple):
+    """The fast camera beside MuJoCo Warp's batch renderer."""
+
+    fast: float  # frames a second of processor time
+    warp: float
+    same: float  # share of pixels on whose material and face they agree
+
+
+def camera_against_warp(
+    layout: Layout, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"], rounds: int
+) -> WarpCost:
+    """Both draw the same scenes in turns, Warp on the CPU too; arguments as for `FastCamera.frames`."""
+    from lt_lib.envs.warp_camera import WarpCamera  # here, since Warp takes seconds to import
+
+    fast, warp, scenes = FastCamera(layout), WarpCamera(layout, len(eyes)), (eyes, slabs, others)
+    same = float((fast.frames(*scenes) == warp.frames(*scenes)).mean())
+    seconds = taking_turns({"fast": lambda: fast.frames(*scenes), "warp": lambda: warp.frames(*scenes)}, rounds)
+    return WarpCost(len(eyes) / seconds["fast"], len(eyes) / seconds["warp"], same)
 
 
 # --- workers
