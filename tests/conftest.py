@@ -21,6 +21,14 @@ import lt_lib.perception.renewal  # noqa: F401
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")
 
 
+def pytest_collection_modifyitems(items):
+    """A file's tests share a process, and so do all that work in this checkout's own outputs, which begin."""
+    for item in items:
+        ours = item.path.suffix == ".ipynb" or item.path.name == "test_smoke.py"
+        item.add_marker(pytest.mark.xdist_group("outputs" if ours else item.path.name))
+    items.sort(key=lambda item: item.get_closest_marker("xdist_group").args != ("outputs",))
+
+
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """A project's root with two notebooks that compute; they find our modules, and we their settings."""

@@ -31,7 +31,7 @@ from lt_lib.perception import capture
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.matched import PictureEncoder, colour_codes, select, train_matched_encoder
-from lt_lib.perception.probe import fit_probe, frechet, placements_right, red_shares, transfer
+from lt_lib.perception.probe import decoded, fit_probe, frechet, placements_right, red_shares, transfer
 from lt_lib.perception.randomise import NOT_RED, TEXTURED, draw_appearances, recoloured
 from lt_lib.perception.real_frames import read_sessions
 from lt_lib.perception.sessions import EFFECTS, Session, film_session, film_sweep, simulated_session, with_effect
@@ -326,6 +326,7 @@ def test_the_probe_has_65_parameters_and_its_threshold_is_its_bias():
     probe = fit_probe(latents, hazard)
     assert probe.parameters == 65
     assert ((probe.scores(latents) > 0) == hazard).mean() > 0.95
+    assert decoded(np.array([0.1, -0.1, 2.0, -2.0]), np.array([True, False, True, False])) == (1.0, 1.0)
     moved = probe._replace(bias=probe.bias + 50)
     assert (moved.scores(latents) > 0).all()
 
