@@ -21,6 +21,7 @@ import lt_lib.perception.renewal  # noqa: F401
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")
 
 
+@pytest.hookimpl(tryfirst=True)  # before the groups are read
 def pytest_collection_modifyitems(items):
     """A file's tests share a process, and so do all that work in this checkout's own outputs, which begin."""
     for item in items:
