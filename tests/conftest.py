@@ -21,13 +21,9 @@ import lt_lib.perception.renewal  # noqa: F401
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")
 
 
-@pytest.hookimpl(tryfirst=True)  # before the groups are read
 def pytest_collection_modifyitems(items):
-    """A file's tests share a process, and so do all that work in this checkout's own outputs, which begin."""
-    for item in items:
-        ours = item.path.suffix == ".ipynb" or item.path.name == "test_smoke.py"
-        item.add_marker(pytest.mark.xdist_group("outputs" if ours else item.path.name))
-    items.sort(key=lambda item: item.get_closest_marker("xdist_group").args != ("outputs",))
+    """The longest file first, and the notebooks last, when it has left them their finished runs."""
+    items.sort(key=lambda item: (item.path.suffix == ".ipynb") - (item.path.name == "test_smoke.py"))
 
 
 @pytest.fixture
