@@ -21,11 +21,6 @@ import lt_lib.perception.renewal  # noqa: F401
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")
 
 
-def pytest_collection_modifyitems(items):
-    """The longest file first, and the notebooks last, when it has left them their finished runs."""
-    items.sort(key=lambda item: (item.path.suffix == ".ipynb") - (item.path.name == "test_smoke.py"))
-
-
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """A project's root with two notebooks that compute; they find our modules, and we their settings."""
