@@ -34,7 +34,15 @@ def require_known(names: Iterable[str], known: Collection[str], what: str, where
     """Raises UserError for the first of the names of some `what` that is not a known one; `where`: 'seeds: '."""
     for name in names:
         if name not in known:
-            raise UserError(f"{where}unknown {what} '{name}'; there are {', '.join(known)}")
+            raise UserError(f"{where}unknown {what} {name!r}; there are {', '.join(known)}")
+
+
+def read_yaml(path: Path) -> Any:
+    """What a yaml file holds. Raises UserError, one line, if it cannot be read."""
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise UserError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
 
 
 def _frozen(value: Any) -> Any:
@@ -86,8 +94,7 @@ def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
 
     Raises UserError for an unknown profile, notebook or parameter, or a value of the wrong type or range.
     """
-    if name not in profile_names(root):
-        raise UserError(f"unknown profile {name!r}; there are {', '.join(profile_names(root))}")
+    require_known([name], profile_names(root), "profile")
     folder = root / "notebooks"
     defaults = {book: notebook_defaults(folder / f"{book}.ipynb") for book in notebook_names(root)}
     sections = _read_sections(root / "params" / f"{name}.yaml", defaults)
@@ -120,8 +127,8 @@ def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dic
     if not isinstance(sections, dict):
         raise UserError(f"{path.name}: expected sections such as 'shared:', got {sections!r}")
     for section, values in sections.items():
-        if section != "shared" and section not in defaults:
-            raise UserError(f"{path.name}: unknown notebook {section!r}; there are {', '.join(defaults)}")
+        if section != "shared":
+            require_known([section], defaults, "notebook", f"{path.name}: ")
         if not isinstance(values, dict):
             raise UserError(f"{path.name}: {section}: expected its parameters below it, got {values!r}")
     declared = {key for names in defaults.values() for key in names}

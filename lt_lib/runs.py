@@ -157,7 +157,7 @@ class RunStore:
             from lt_lib.cluster import cluster_workers  # here, since Dask takes a second to import
 
             return cluster_workers(self.workers, progress)
-        source = "".join(sorted({source_state(run.function) for run in missing.values()}))
+        source = "".join(sorted({source_state(function) for function in {run.function for run in missing.values()}}))
         return _local_workers(min(self.workers or joblib.cpu_count(), len(missing)), source, progress)
 
     def _end(self, key: str, run: Run, future: "Future[Packed]") -> BaseException | None:

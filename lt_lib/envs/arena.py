@@ -39,7 +39,7 @@ class Arena:
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._mocap = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
         self._warm = self._batch.bind("qacc_warmstart")
-        self._slab_centre = np.array([_centre(layout.slab(side)) for side in (0, 1)])
+        self._slab_centre = np.array([layout.slab(side).centre for side in (0, 1)])
         self.slab = np.zeros(n, np.int64)
         self.scout = np.tile(layout.scout.array, (n, 1))
 
@@ -83,16 +83,11 @@ class Arena:
         self.corridor = np.where(left.contains(x, y), 0, np.where(right.contains(x, y), 1, NO_CORRIDOR))
 
 
-def _centre(box: Box):
-    x0, x1, y0, y1 = box.bounds
-    return (x0 + x1) / 2, (y0 + y1) / 2
-
-
 def physics_xml(layout: Layout) -> str:
     """MJCF of what can be bumped into; planar, without a floor, the robot's disc as a sphere."""
-    walls = "".join(_solid(wall) for wall in layout.walls)
+    walls = "".join(solid(wall) for wall in layout.walls)
     slab = layout.slab(0)
-    (cx, cy), (x0, x1, y0, y1) = _centre(slab), slab.bounds
+    (cx, cy), (x0, x1, y0, y1) = slab.centre, slab.bounds
     centred = Box((x0 - cx, x1 - cx, y0 - cy, y1 - cy), layout.wall_height, "slab")
     radius = layout.robot.radius
     return f"""
@@ -101,7 +96,7 @@ def physics_xml(layout: Layout) -> str:
   <default><geom condim="1" contype="1" conaffinity="2"/></default>
   <worldbody>
     {walls}
-    <body name="slab" mocap="true">{_solid(centred)}</body>
+    <body name="slab" mocap="true">{solid(centred)}</body>
     <body name="scout" mocap="true" pos="0 0 {radius}"><geom type="sphere" size="{radius}"/></body>
     <body name="navigator" pos="0 0 {radius}">
       <joint name="x" type="slide" axis="1 0 0"/>
@@ -118,7 +113,9 @@ def physics_xml(layout: Layout) -> str:
 </mujoco>"""
 
 
-def _solid(box: Box) -> str:
+def solid(box: Box, attributes: str = "") -> str:
+    """MJCF of a box, with further attributes of its geom."""
     x0, x1, y0, y1 = box.bounds
-    centre = f"{(x0 + x1) / 2:.6f} {(y0 + y1) / 2:.6f} {box.height / 2:.6f}"
-    return f'<geom type="box" pos="{centre}" size="{(x1 - x0) / 2:.6f} {(y1 - y0) / 2:.6f} {box.height / 2:.6f}"/>'
+    centre = " ".join(f"{value:.6f}" for value in (*box.centre, box.height / 2))
+    size = f"{(x1 - x0) / 2:.6f} {(y1 - y0) / 2:.6f} {box.height / 2:.6f}"
+    return f'<geom type="box" pos="{centre}" size="{size}" {attributes}/>'

@@ -110,6 +110,12 @@ class Box(NamedTuple):
     height: float
     material: str
 
+    @property
+    def centre(self) -> tuple[float, float]:
+        """x, y of the footprint's centre, metres."""
+        x0, x1, y0, y1 = self.bounds
+        return (x0 + x1) / 2, (y0 + y1) / 2
+
 
 class Layout(Settings):
     """The scene. Use `load_layout` to read one; its geometry is checked when it is read."""

@@ -20,7 +20,7 @@ class ReferenceCamera:
         self._layout = layout
         self.model = mujoco.MjModel.from_xml_string(scene_xml(layout, self.pixels))
         self._data = mujoco.MjData(self.model)
-        self._renderer = _renderer(self.model, self.pixels, self.pixels)
+        self._renderer = open_renderer(self.model, self.pixels, self.pixels)
         self._options = _looking_at(SEEN, SCOUT)
         self._index = palette_indices(self.model)
 
@@ -67,7 +67,7 @@ class TopView:
         self._layout = layout
         self.model = mujoco.MjModel.from_xml_string(scene_xml(layout, max(width, height)))
         self._data = mujoco.MjData(self.model)
-        self._renderer = _renderer(self.model, height, width)
+        self._renderer = open_renderer(self.model, height, width)
         self._options = _looking_at(SEEN, SCOUT, NAVIGATOR, FROM_ABOVE)
 
     def picture(self, navigator, slab: int, scout) -> UInt8[np.ndarray, "h w 3"]:
@@ -80,11 +80,9 @@ class TopView:
 def place(layout: Layout, model, data, eye, slab: int, other):
     """Puts navigator (metres, radians), slab (0 left, 1 right) and the other robot into an MjData."""
     height = layout.camera.height
-    footprint = layout.slab(slab)
     data.mocap_pos[model.body("navigator").mocapid[0]] = (eye[0], eye[1], height)
     data.mocap_quat[model.body("navigator").mocapid[0]] = (np.cos(eye[2] / 2), 0, 0, np.sin(eye[2] / 2))
-    x0, x1, y0, y1 = footprint.bounds
-    data.mocap_pos[model.body("slab").mocapid[0]] = ((x0 + x1) / 2, (y0 + y1) / 2, 0)
+    data.mocap_pos[model.body("slab").mocapid[0]] = (*layout.slab(slab).centre, 0)
     data.mocap_pos[model.body("scout").mocapid[0]] = (other[0], other[1], 0)
     mujoco.mj_forward(model, data)
 
@@ -189,7 +187,8 @@ def _looking_at(*groups: int) -> mujoco.MjvOption:
     return options
 
 
-def _renderer(model, height: int, width: int) -> mujoco.Renderer:
+def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    """Raises UserError, one line, where there is no OpenGL."""
     try:
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # MuJoCo raises plain RuntimeError, FatalError or AttributeError, by platform

@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from lt_lib.envs.arena import solid
 from lt_lib.envs.bench import OBJECTS, Placements
-from lt_lib.envs.layout import Box, Layout
-from lt_lib.params import UserError
+from lt_lib.envs.layout import Layout
+from lt_lib.envs.reference import open_renderer
 
 TEXELS = 256
 TILE = 0.5  # metres that a texture spans
@@ -35,10 +36,7 @@ class SurrogateScene:
         _paint(self._model)
         model = self._model
         self._lights = model.light_diffuse.copy(), model.light_specular.copy(), model.vis.headlight.ambient.copy()
-        try:
-            self._renderer = mujoco.Renderer(self._model, height, width)
-        except Exception as error:  # MuJoCo raises plain RuntimeError, FatalError or AttributeError, by platform
-            raise UserError("the surrogate camera found no OpenGL; see README, Running") from error
+        self._renderer = open_renderer(self._model, height, width)
 
     def picture(self, placements: Placements, i: int, clutter: int) -> UInt8[np.ndarray, "h w 3"]:
         """Placement i, RGB, with `clutter` objects on the floor; under two lamps, or under one if it is a dim one."""
@@ -54,9 +52,8 @@ class SurrogateScene:
     def _place(self, placements: Placements, i: int, clutter: int):
         x, y, heading = placements.eye[i]
         self._move("eye", (x, y, self._layout.camera.height), heading)
-        x0, x1, y0, y1 = self._layout.slab(int(placements.slab[i])).bounds
-        dx, dy, turn = placements.slab_offset[i]
-        self._move("slab", ((x0 + x1) / 2 + dx, (y0 + y1) / 2 + dy, self._layout.slab_height / 2), turn)
+        slab, (dx, dy, turn) = self._layout.slab(int(placements.slab[i])).centre, placements.slab_offset[i]
+        self._move("slab", (slab[0] + dx, slab[1] + dy, self._layout.slab_height / 2), turn)
         for k, (x, y, width, height, yaw, *colour, shape) in enumerate(placements.clutter[i]):
             geom = self._model.geom(f"clutter {k}").id
             # an object that is not there lies under the floor
@@ -92,6 +89,7 @@ def scene_xml(layout: Layout, width: int, height: int, fovy: float) -> str:
         f'<body name="clutter {k}" mocap="true"><geom name="clutter {k}" type="box" size=".1 .1 .1"/></body>'
         for k in range(OBJECTS)
     )
+    walls = "".join(solid(wall, f'material="{wall.material}"') for wall in layout.walls)
     lamp = 'type="spot" cutoff="85" exponent="1" castshadow="true" attenuation="1 0 0" specular="0.3 0.3 0.3"'
     return f"""
 <mujoco>
@@ -111,7 +109,7 @@ def scene_xml(layout: Layout, width: int, height: int, fovy: float) -> str:
     <light name="left" {lamp} pos="{x1 + 1.2} 1.6 2.6" dir="-0.35 -0.5 -1" diffuse="0.5 0.5 0.48"/>
     <light name="right" {lamp} pos="{x1 + 2.4} -1.4 2.6" dir="-0.7 0.35 -1" diffuse="0.4 0.4 0.42"/>
     <geom type="plane" size="20 20 1" material="floor"/>
-    {"".join(_solid(wall) for wall in layout.walls)}
+    {walls}
     <body name="slab" mocap="true">
       <geom type="box" size="{(x1 - x0) / 2} {(y1 - y0) / 2} {layout.slab_height / 2}" material="slab"/>
     </body>
@@ -119,12 +117,6 @@ def scene_xml(layout: Layout, width: int, height: int, fovy: float) -> str:
     <body name="eye" mocap="true"><camera name="eye" fovy="{fovy}" xyaxes="0 -1 0 0 0 1"/></body>
   </worldbody>
 </mujoco>"""
-
-
-def _solid(box: Box) -> str:
-    x0, x1, y0, y1 = box.bounds
-    centre, half = ((x0 + x1) / 2, (y0 + y1) / 2, box.height / 2), ((x1 - x0) / 2, (y1 - y0) / 2, box.height / 2)
-    return f'<geom type="box" pos="{_numbers(centre)}" size="{_numbers(half)}" material="{box.material}"/>'
 
 
 def _numbers(values) -> str:

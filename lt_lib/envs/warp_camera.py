@@ -52,7 +52,7 @@ class WarpCamera:
         turn[:, self._mocap["navigator"]] = 0
         turn[:, self._mocap["navigator"], 0] = np.cos(eyes[:, 2] / 2)
         turn[:, self._mocap["navigator"], 3] = np.sin(eyes[:, 2] / 2)
-        centres = np.array([np.reshape(self._layout.slab(side).bounds, (2, 2)).mean(axis=1) for side in (0, 1)])
+        centres = np.array([self._layout.slab(side).centre for side in (0, 1)])
         position[:, self._mocap["slab"], :2] = centres[slabs]
         position[:, self._mocap["scout"], :2] = others
         with wp.ScopedDevice(self._device):

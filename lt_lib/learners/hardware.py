@@ -128,8 +128,8 @@ class HardwareProtocol:
 
     def ordinary(self, effects: Sequence[str]) -> dict[str, float]:
         """The strength of each effect in the live session."""
-        live = self.sessions.live
-        return {effect: float((live.optics.model_dump() | live.bench.model_dump())[effect]) for effect in effects}
+        strengths = self.sessions.live.optics.model_dump() | self.sessions.live.bench.model_dump()
+        return {effect: float(strengths[effect]) for effect in effects}
 
     def after_selection(self, candidate: str, encoder: Result, seeds: int) -> tuple[Result, list[Result]]:
         """The executor behind the selected encoder, and encoders of the cheaper size in its appearances, one a seed.

@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from lt_lib.envs.optics import CROP, crop
-from lt_lib.params import UserError
+from lt_lib.params import UserError, require_known
 from lt_lib.perception.sessions import Session
 
 LABELS, OPTICS = "labels.csv", "optics.yaml"
@@ -85,8 +85,7 @@ def _check_row(row: Mapping[str, str], folder: Path, where: str) -> None:
     if None in row or None in row.values():
         raise UserError(f"{where}: expected {len(COLUMNS)} values")
     for column, words in WORDS.items():
-        if row[column] not in words:
-            raise UserError(f"{where}: unknown {column} '{row[column]}'; there are {', '.join(words)}")
+        require_known([row[column]], words, column, f"{where}: ")
     for column, kind, what in (("placement", int, "a whole number"), ("distance_cm", float, "a distance in cm")):
         if not _is_positive(row[column], kind):
             raise UserError(f"{where}: {column} must be {what}, at least 0, got '{row[column]}'")

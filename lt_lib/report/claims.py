@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from lt_lib.files import content_digest, writable_folder, write_atomically
-from lt_lib.params import ROOT, Settings, UserError, explain
+from lt_lib.params import ROOT, Settings, UserError, explain, read_yaml, require_known
 
 Notebook = Literal[
     "01_occlusion_check", "02_encoder", "03_gridworld", "04_pixels", "05_coverage_sweep",
@@ -119,10 +118,7 @@ def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
     Raises UserError, one line with the id, for an unreadable file, an unknown key or notebook, a missing or
     malformed value, an id given twice, and a criterion that does not suit the kind.
     """
-    try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise UserError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+    entries = read_yaml(path)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise UserError(f"{path.name}: expected a list of entries '- {{id: ..., nb: ..., ...}}'")
     claims: dict[str, Claim] = {}
@@ -215,8 +211,7 @@ class Findings:
     """
 
     def __init__(self, notebook: str, outputs: Path, profile: str, claims: Mapping[str, Claim] | None = None):
-        if notebook not in Notebook.__args__:
-            raise UserError(f"unknown notebook {notebook!r}; there are {', '.join(Notebook.__args__)}")
+        require_known([notebook], Notebook.__args__, "notebook")
         everything = load_claims() if claims is None else claims
         self.notebook, self.profile = notebook, profile
         self.path = Path(outputs) / "results" / f"{notebook}.json"

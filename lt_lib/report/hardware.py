@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lt_lib.perception.matched import PictureEncoder
-from lt_lib.perception.probe import Transfer, decoded, frechet, placements_right, red_shares
+from lt_lib.perception.probe import Transfer, decoded, fit_probe, frechet, placements_right, red_shares
 from lt_lib.perception.sessions import EFFECTS, Session
 from lt_lib.report import stats
 from lt_lib.report.style import ROLES, chance_line
@@ -55,14 +55,16 @@ def shift_table(transfers: Mapping[str, Transfer], simulated_again: Mapping[str,
     return pd.DataFrame(table).T.round(1)
 
 
-def colour_table(sessions: Mapping[str, Session]) -> pd.DataFrame:
+def colour_table(sessions: Mapping[str, Session], red_ratio: float) -> pd.DataFrame:
     """Mean ± standard deviation of red, green and blue, and the share of red pixels, by session and answer."""
     rows = {}
     for name, session in sessions.items():
         for answer, which in (("hazard", session.hazard), ("clear", ~session.hazard)):
             pixels = session.frames[which].reshape(-1, 3).astype(float)
             levels = {c: f"{m:.0f} ± {s:.0f}" for c, m, s in zip("RGB", pixels.mean(0), pixels.std(0), strict=True)}
-            rows[f"{name}, {answer}"] = levels | {"red pixels": f"{red_shares(session.frames[which], 1.5).mean():.2f}"}
+            rows[f"{name}, {answer}"] = levels | {
+                "red pixels": f"{red_shares(session.frames[which], red_ratio).mean():.2f}"
+            }
     return pd.DataFrame(rows).T
 
 
@@ -171,12 +173,18 @@ def what_breaks(
     return figure
 
 
-def under_effect(transfer: Transfer, encoder: Result, sweep: Result) -> Float[np.ndarray, " s"]:
-    """Balanced accuracy of the refit probe at each strength of one effect."""
+def under_effects(encoder: Result, refit: Session, sweeps: Mapping[str, Result]) -> dict[str, Float[np.ndarray, " s"]]:
+    """Balanced accuracy at each strength of each effect, of the probe fitted to a refit session."""
     network = PictureEncoder(encoder)
-    return np.array(
-        [decoded(transfer.refit.scores(network.latents(each)), sweep["hazard"]).balanced for each in sweep["frames"]]
-    )
+    probe = fit_probe(network.latents(refit.frames), refit.hazard)
+
+    def accuracy(frames, hazard) -> float:
+        return decoded(probe.scores(network.latents(frames)), hazard).balanced
+
+    return {
+        effect: np.array([accuracy(frames, sweep["hazard"]) for frames in sweep["frames"]])
+        for effect, sweep in sweeps.items()
+    }
 
 
 def break_table(

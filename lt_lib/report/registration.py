@@ -6,11 +6,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
 from pydantic import ValidationError
 
 from lt_lib.files import write_atomically
-from lt_lib.params import ROOT, HardwareGates, UserError, explain
+from lt_lib.params import ROOT, HardwareGates, UserError, explain, read_yaml
 
 GATES = ROOT / "params" / "gates" / "hardware.yaml"
 RECORD = "hardware_gates.json"
@@ -57,8 +56,6 @@ def register(outputs: Path, path: Path = GATES) -> Registration:
 def read_gates(path: Path = GATES) -> HardwareGates:
     """Raises UserError, one line, for a file that is missing, no yaml, or not what gates look like."""
     try:
-        return HardwareGates.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, yaml.YAMLError) as error:
-        raise UserError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+        return HardwareGates.model_validate(read_yaml(path))
     except ValidationError as error:
         raise UserError(explain(error, path.name, HardwareGates)) from None
