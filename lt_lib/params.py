@@ -467,6 +467,8 @@ class Stretch(Settings):
     rounds: PositiveInt  # in which all sides take turns
     scenes: PositiveInt  # draws of the scene behind either precision
     live: PositiveInt  # episodes
+    navigator: PositiveInt  # control steps of a navigator's training, profiled
+    frames: PositiveInt  # of a matched encoder's training, profiled
     singles: PositiveInt  # runs of a stack timed one by one
     runs: PositiveInt  # shared among workers
     updates: Budget  # of the point-mass study

@@ -12,6 +12,7 @@ import os
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from contextlib import AbstractContextManager
@@ -205,7 +206,9 @@ def _local_workers(processes: int, source: str, progress: Path) -> Iterator[Subm
         processes, timeout=IDLE_S, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(), source)
     )
     try:
-        yield lambda key, run: pool.submit(compute, run, partial(write_fraction, progress / f"{key}.json"))
+        with warnings.catch_warnings():  # loky replaces a worker that has grown or idled, and says so each time
+            warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
+            yield lambda key, run: pool.submit(compute, run, partial(write_fraction, progress / f"{key}.json"))
     except BaseException:
         pool.shutdown(wait=True, kill_workers=True)
         raise

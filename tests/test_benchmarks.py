@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+import torch
 
 from lt_lib.report import benchmarks
 from lt_lib.timing import taking_turns
@@ -21,6 +22,16 @@ def test_turns_alternate_and_the_first_round_is_not_counted():
     seconds = taking_turns({name: lambda name=name: call(name) for name in "ab"}, 3, lambda: now[0])
     assert heard == list("abababab")
     assert seconds == {"a": 2.0, "b": 20.0}
+
+
+def test_all_sides_are_timed_with_one_thread_as_in_a_worker():
+    before = torch.get_num_threads()
+    threads = set()
+    torch.set_num_threads(2)
+    taking_turns({"a": lambda: threads.add(torch.get_num_threads())}, 1)
+    benchmarks.profile(lambda: threads.add(torch.get_num_threads()), 1)
+    assert threads == {1} and torch.get_num_threads() == 2
+    torch.set_num_threads(before)
 
 
 def test_growth_finds_the_exponent_of_a_power_law(monkeypatch):

@@ -3,16 +3,17 @@
 MuJoCo Warp is written for NVIDIA GPUs and runs on a CPU too.
 """
 
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR  # before MuJoCo Warp starts it: it would list its devices and all its kernels
+
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
-import warp as wp
 from jaxtyping import Float, Int, UInt8
 
 from lt_lib.envs.layout import Layout
 from lt_lib.envs.reference import SCOUT, SEEN, palette_indices, scene_xml
-
-wp.config.quiet = True  # it would list its devices and every kernel that it compiles
 
 
 class WarpCamera:

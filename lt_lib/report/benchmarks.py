@@ -24,15 +24,17 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
 from lt_lib.learners.episodes import SLABS, Draws, draw_scenes, roll_bank
 from lt_lib.learners.executor import FrozenExecutor
+from lt_lib.learners.navigator import train_navigator
 from lt_lib.learners.protocol import Protocol
 from lt_lib.learners.redraw import train_redrawn_head
 from lt_lib.learners.route import train_head
 from lt_lib.learners.score_function import train_point_mass
-from lt_lib.params import PointMassConfig
+from lt_lib.params import MatchedEncoderConfig, NavigatorConfig, PointMassConfig
 from lt_lib.perception.encoder import FrozenEncoder
+from lt_lib.perception.matched import train_matched_encoder
 from lt_lib.report.style import ROLES
 from lt_lib.runs import Result, Run, RunStore
-from lt_lib.timing import taking_turns
+from lt_lib.timing import one_thread, taking_turns
 
 PRECISIONS = ("float32", "bfloat16")
 
@@ -93,11 +95,10 @@ class BankCost(NamedTuple):
 
 
 def bank_against_live(protocol: Protocol, bank: Result, encoder: Result, executor: Result, episodes: int) -> BankCost:
-    """What a head costs either way, from stretches of `episodes` episodes scaled to the protocol's own numbers."""
-    entries = max(episodes // bank["success"][0].size, 1)
+    """What a head costs either way, from so many live episodes and a bank of so many draws, scaled to the real ones."""
     frozen = {"encoder": encoder, "executor": executor}
     scenes = {name: bank[name] for name in ("spawn", "scout")}
-    rolled = protocol.bank.model_copy(update={"entries": entries})
+    rolled = protocol.bank.model_copy(update={"entries": episodes})
     once = protocol.redraw.model_copy(
         update={
             "every": 0,
@@ -114,7 +115,7 @@ def bank_against_live(protocol: Protocol, bank: Result, encoder: Result, executo
     }
     seconds = taking_turns(calls, 1)
     return BankCost(
-        seconds["bank"] * protocol.bank.entries * protocol.shards / entries,
+        seconds["bank"] * protocol.bank.entries * protocol.shards / episodes,
         seconds["head"],
         seconds["live"] * protocol.head.episodes / episodes,
     )
@@ -239,7 +240,8 @@ def stages(manifest: Path) -> pd.DataFrame:
 def profile(call: Callable[[], Any], most: int) -> pd.DataFrame:
     """The functions that a call spends most of its time in, not counting what they call: seconds and share."""
     profiler = cProfile.Profile()
-    profiler.runcall(call)
+    with one_thread():
+        profiler.runcall(call)
     table = {
         f"{Path(file).name}:{name}" if "~" not in file else name: {"seconds": own, "calls": calls}
         for (file, _, name), (_, calls, own, _, _) in pstats.Stats(profiler).stats.items()
@@ -248,12 +250,27 @@ def profile(call: Callable[[], Any], most: int) -> pd.DataFrame:
     return table.assign(share=table.seconds / table.seconds.sum()).head(most)
 
 
-def live_training(
-    protocol: Protocol, bank: Result, encoder: Result, executor: Result, episodes: int
-) -> Callable[[], dict]:
-    """A stretch of live training with a draw at every step, to be profiled."""
-    config = protocol.redraw.model_copy(
+def profiles(calls: Mapping[str, Callable[[], Any]], most: int) -> pd.DataFrame:
+    """The profile of each call, one below the other."""
+    return pd.concat({name: profile(call, most) for name, call in calls.items()})
+
+
+def training_stretches(
+    protocol: Protocol, bank: Result, encoder: Result, executor: Result, episodes: int, steps: int, frames: int
+) -> dict[str, Callable[[], dict]]:
+    """Stretches of the trainings that take the most time, by stage, to be profiled.
+
+    episodes  of a head that draws at every step;  steps  of a navigator's control;  frames  of a matched encoder
+    """
+    frozen = {"encoder": encoder, "executor": executor}
+    scenes = {name: bank[name] for name in ("spawn", "scout")}
+    head = protocol.redraw.model_copy(
         update={"every": 1, "content": "latent", "credit": "episode", "episodes": episodes}
     )
-    scenes = {name: bank[name] for name in ("spawn", "scout")}
-    return lambda: train_redrawn_head(config, 0, report=_unheard, scenes=scenes, encoder=encoder, executor=executor)
+    navigator = NavigatorConfig(steps=steps, layout=protocol.encoder.layout, precision=protocol.redraw.precision)
+    matched = MatchedEncoderConfig(frames=frames, texture=0.1)
+    return {
+        "train_redrawn_head": lambda: train_redrawn_head(head, 0, report=_unheard, scenes=scenes, **frozen),
+        "train_navigator": lambda: train_navigator(navigator, 0, report=_unheard, encoder=encoder),
+        "train_matched_encoder": lambda: train_matched_encoder(matched, 0, report=_unheard),
+    }

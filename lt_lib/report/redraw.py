@@ -136,13 +136,13 @@ def what_decides(heads: Mapping[str, Sequence[Result]], batch: int) -> Figure:
                 episodes = np.arange(1, len(head["entropy"]) + 1) * batch
                 upper.plot(episodes, _by_batch(head["optimal"], batch), color=colour, lw=1.2, alpha=0.8)
                 lower.plot(episodes, head["entropy"], color=colour, lw=1.2, alpha=0.8)
-            upper.plot([], [], color=colour, label=words)
+            lower.plot([], [], color=colour, label=words)
         upper.set(title=REDRAWS[row].words, ylim=(0.3, 1.03))
         chance_line(upper)
-        upper.legend(loc="lower right", fontsize=9)
         lower.axhline(np.log(2), color="black", ls="--", lw=0.8)
+        lower.legend(loc="lower left", fontsize=9)
         lower.set(xlabel="training episodes", ylim=(0, 0.72))
-    panels[0, 0].set_ylabel("route optimality of a batch")
+    panels[0, 0].set_ylabel("route optimality of a batch\ndotted: chance")
     panels[1, 0].set_ylabel("entropy of a draw (nats)\ndashed: uniform")
     return figure
 
