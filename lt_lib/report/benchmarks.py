@@ -223,6 +223,8 @@ def growth_figure(growths: Sequence[Growth]) -> Figure:
         axes.loglog(sizes, seconds[-1] * sizes / sizes[-1], ":", color="black", lw=1)
         axes.set_title(f"{each.what}\nslope {each.slope:.2f} [{each.low:.2f}, {each.high:.2f}]", fontsize=10)
         axes.set(xlabel=each.what.split(" ")[0], ylabel="processor time (s)")
+        axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        axes.set_xticks([], minor=True)
     return figure
 
 

@@ -184,13 +184,15 @@ def boosts(trained: Mapping[str, Result], incumbent: int, block: int, paper: Map
     """Success where the slab blocks the incumbent, over iterations, and the boost, by what becomes of the boost."""
     figure = Figure(figsize=(9.5, 5.4), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
-    for (name, result), role in zip(trained.items(), ("ours", "kinematic", "lower bound"), strict=True):
+    places = {"ours": -0.12, "kinematic": 0.0, "lower bound": 0.12}  # beside each other, of a block's width
+    for (name, result), (role, place) in zip(trained.items(), places.items(), strict=True):
         edges = np.arange(0, len(result["boost"]) + block, block)
         counts = alternative_success(result, incumbent, edges)
         low, high = np.array([stats.wilson(s, n) if n else (0.0, 1.0) for s, n in counts]).T
         mean = counts[:, 0] / np.maximum(counts[:, 1], 1)
         error = [mean - low, high - mean]
-        upper.errorbar(edges[1:] - block / 2, mean, error, fmt="o-", color=ROLES[role], capsize=3, label=name)
+        middle = edges[1:] + (place - 0.5) * block
+        upper.errorbar(middle, mean, error, fmt="o-", color=ROLES[role], capsize=3, label=name)
         lower.plot(np.arange(1, len(result["boost"]) + 1), result["boost"], color=ROLES[role])
     for edges, claim in ((EARLY, "cov.boost_early"), (LATE, "cov.boost_late")):
         upper.fill_between([edges[0], edges[-1]], *paper[claim].paper, color="0.8", zorder=0)
