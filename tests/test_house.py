@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 
 import pytest
 
@@ -11,6 +12,7 @@ from lt_lib.report.readme import FULL, README, refreshed
 FLOORS = {"params": 0, "runs": 0, "envs": 1, "perception": 2, "comm": 2, "learners": 3, "report": 3}
 LONGEST_CELL = 16
 LONGEST_FUNCTION = 60
+FOLDER = re.compile(r"(?:^|[\s'\"(=])(/(?:home|root|tmp|usr|work|Users)/[^\s'\"]*)")
 
 
 def modules():
@@ -57,6 +59,17 @@ def test_source_notebooks_are_short_cells_of_calls_without_outputs(name):
         assert not cell["outputs"] and cell["execution_count"] is None
         assert len(lines) <= LONGEST_CELL
         assert not any(line.startswith(("def ", "class ")) for line in lines)
+
+
+@pytest.mark.parametrize("path", sorted(FULL.glob("notebooks/*.ipynb")), ids=lambda path: path.stem)
+def test_committed_notebooks_name_no_folder_of_the_machine_they_ran_on(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    shown = [
+        "".join(each.get("text", each.get("data", {}).get("text/plain", "")))
+        for cell in cells
+        for each in cell.get("outputs", [])
+    ]
+    assert not FOLDER.findall("\n".join(shown))
 
 
 @pytest.mark.skipif(not (FULL / "scoreboard.csv").exists(), reason="no full run is committed")
