@@ -1,6 +1,7 @@
 """Figures and judgements of the pixel experiments (Table III, Fig. 4, Table IV)."""
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -76,8 +77,8 @@ def table(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> pd
 
 
 def _wrapped(name: str) -> str:
-    """A condition's words on two lines."""
-    return CONDITIONS[name].words.replace(" (", "\n(").replace(", ", ",\n").replace("raw ", "raw\n")
+    """A condition's words in lines that do not reach the next one's."""
+    return fill(CONDITIONS[name].words, 15, break_long_words=False)
 
 
 def routes(heads: Mapping[str, Sequence[Result]], paper: Mapping[str, Any]) -> Figure:
