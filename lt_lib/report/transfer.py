@@ -144,7 +144,7 @@ class Diagnosis(NamedTuple):
 
 
 def bit_diagnosis(flips: Mapping[tuple[str, bool], Sequence[Result]], incumbents: Sequence[int]) -> Diagnosis:
-    """From `Transfer.flipped` and every seed's incumbent corridor."""
+    """From `Examined.flips` and every seed's incumbent corridor."""
     shift = [np.concatenate([r[i]["shift"][0] for r in flips.values()]).mean(0) for i in range(len(incumbents))]
     first = [np.concatenate([r[i]["first"][0] for r in flips.values()]) == side for i, side in enumerate(incumbents)]
     succeeded = [
