@@ -12,7 +12,11 @@ from lt_lib.report.readme import FULL, README, refreshed
 FLOORS = {"params": 0, "runs": 0, "envs": 1, "perception": 2, "comm": 2, "learners": 3, "report": 3}
 LONGEST_CELL = 16
 LONGEST_FUNCTION = 60
+LONGEST_FULL_RUN_S = 2 * 3600
+TRAIN_OR_EVALUATE = {name for name in notebook_names() if name[:2] in ("02", "03", "04", "05", "06", "07", "08")}
 FOLDER = re.compile(r"(?:^|[\s'\"(=])(/(?:home|root|tmp|usr|work|Users)/[^\s'\"]*)")
+
+needs_a_full_run = pytest.mark.skipif(not (FULL / "scoreboard.csv").exists(), reason="no full run is committed")
 
 
 def modules():
@@ -72,7 +76,18 @@ def test_committed_notebooks_name_no_folder_of_the_machine_they_ran_on(path):
     assert not FOLDER.findall("\n".join(shown))
 
 
-@pytest.mark.skipif(not (FULL / "scoreboard.csv").exists(), reason="no full run is committed")
+@needs_a_full_run
+def test_the_committed_full_run_computed_everything_in_one_sitting_of_two_hours_at_most():
+    notebooks = json.loads((FULL / "manifest.json").read_text(encoding="utf-8"))["notebooks"]
+    assert list(notebooks) == list(notebook_names())
+    assert {entry["status"] for entry in notebooks.values()} == {"ok"}
+    assert not any(entry["uncommitted_changes"] for entry in notebooks.values())
+    assert {name for name, entry in notebooks.items() if entry["stages"]} >= TRAIN_OR_EVALUATE  # nothing had been kept
+    assert sum(entry["seconds"] for entry in notebooks.values()) <= LONGEST_FULL_RUN_S
+    assert "not run" not in (FULL / "scoreboard.csv").read_text(encoding="utf-8")
+
+
+@needs_a_full_run
 def test_the_readme_s_headline_is_that_of_the_committed_full_run():
     text = README.read_text(encoding="utf-8")
     assert refreshed(text) == text, "stale: run python -m lt_lib.report.readme"
