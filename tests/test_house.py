@@ -77,6 +77,19 @@ def test_committed_notebooks_name_no_folder_of_the_machine_they_ran_on(path):
 
 
 @needs_a_full_run
+@pytest.mark.parametrize("name", notebook_names())
+def test_a_committed_notebook_is_the_present_one_executed(name):
+    present, executed = (
+        json.loads((folder / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+        for folder in (ROOT, FULL)
+    )
+    own = [cell for cell in executed if "injected-parameters" not in cell["metadata"]["tags"]]
+    same = ["".join(cell["source"]) for cell in own] == ["".join(cell["source"]) for cell in present]
+    assert same, f"stale: run python run_all.py --only {name}"
+    assert all(cell["execution_count"] for cell in executed if cell["cell_type"] == "code")
+
+
+@needs_a_full_run
 def test_the_committed_full_run_computed_everything_in_one_sitting_of_two_hours_at_most():
     notebooks = json.loads((FULL / "manifest.json").read_text(encoding="utf-8"))["notebooks"]
     assert list(notebooks) == list(notebook_names())
