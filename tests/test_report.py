@@ -399,6 +399,7 @@ def test_deviations_come_worst_first_with_their_notes(tmp_path, few):
     unlike = scoreboard.deviations(*make_board(tmp_path, few))
     assert list(unlike.id) == ["px.latent.route", "px.zero", "e.probe"]
     assert unlike.note.iloc[2] == "tried\nharder"
+    assert list(unlike[scoreboard.DISCUSSED]) == ["04_pixels", "04_pixels", "02_encoder"]
 
 
 def alter(path, change):
@@ -488,7 +489,8 @@ def test_written_board_reads_back(tmp_path, few):
     assert (rows[1]["p"], rows[6]["ours"]) == ("0.5", "")
     text = (tmp_path / "scoreboard.md").read_text()
     assert "**3 reproduced, 1 same direction, 2 not reproduced, 1 not run, of 7**" in text
-    assert "| e.probe | probe \\| accuracy | 0.9 | 0.8 [0.79, 0.81] | ≈ same direction | tried harder |" in text
+    told = "≈ same direction | tried harder | [02_encoder](notebooks/02_encoder.ipynb) |"
+    assert f"| e.probe | probe \\| accuracy | 0.9 | 0.8 [0.79, 0.81] |  |  | {told}" in text
     assert "| px.range | range | measured | 0.98, 1 | 0.97, 1 [0.96, 0.99, 0.98, 1] | 3 |" in text
     assert text.index("## Not as in the paper") < text.index("## 02_encoder") < text.index("## 04_pixels")
     assert "profile" not in text

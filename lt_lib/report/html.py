@@ -117,6 +117,7 @@ def _scoreboard(board: str, names: Sequence[str]) -> str:
     page = markdown2html(re.sub(r"^#", "##", board, flags=re.MULTILINE))
     for name in names:
         page = re.sub(rf"(<h3[^>]*>){name}", rf"\1{_linked(name, names)}", page)
+        page = page.replace(f'<a href="notebooks/{name}.ipynb">{name}</a>', _linked(name, names))
     for kind, mark in MARKS.items():
         cell = f'<td class="verdict" style="color: {mark.colour}">{told(kind)}</td>'
         page = page.replace(f"<td>{told(kind)}</td>", cell)

@@ -25,6 +25,7 @@ from lt_lib.report.claims import (
     verdict,
 )
 
+DISCUSSED = "discussed in"  # the notebook that says what was tried, and what the likeliest cause is
 COLUMNS = ["id", "notebook", "what", "kind", "paper", "ours", "low", "high", "n", "test", "p", "verdict"]
 
 
@@ -47,8 +48,9 @@ MARKS = {
 LEGEND = """\
 Verdicts: ✔ **reproduced** - exact numbers print alike, settings are equal, measured values lie within the
 margin that `params/claims.yaml` fixed beforehand (or meet the check stated there) and the claim's own test
-holds; ≈ **same direction** - the test holds, outside the margin; ✘ **not reproduced** - neither;
-◌ **surrogate** - made with a simulated camera where the paper used the robot's; · **not run** - no finding.
+holds; ≈ **same direction** - the test holds, outside the margin; ✘ **not reproduced** - the test fails, or there
+is none and the value is outside the margin; ◌ **surrogate** - made with a simulated camera where the paper used
+the robot's; · **not run** - no finding. A rank test holds when no seed overlaps those that it is compared with.
 A scene number whose check is 'reported' depends on geometry that the paper does not print: it only has to
 stand beside the paper's."""
 
@@ -141,10 +143,11 @@ def _as_list(value: Any) -> Any:
 
 
 def deviations(board: pd.DataFrame, findings: Mapping[str, Finding]) -> pd.DataFrame:
-    """The rows that did not come out as in the paper, not reproduced ones first, each with its note."""
+    """The rows that did not come out as in the paper, not reproduced ones first, with notes and where they are told."""
     rows = [board[board.verdict == kind] for kind in (NOT_REPRODUCED, SAME_DIRECTION)]
-    part = pd.concat(rows)[["id", "what", "paper", "ours", "low", "high", "p", "verdict"]]
-    return part.assign(note=[findings[name].note for name in part.id])
+    part = pd.concat(rows)[["id", "what", "paper", "ours", "low", "high", "test", "p", "verdict", "notebook"]]
+    notes = [findings[name].note for name in part.id]
+    return part.rename(columns={"notebook": DISCUSSED}).assign(note=notes)
 
 
 def summary(board: pd.DataFrame) -> str:
@@ -177,7 +180,7 @@ def markdown(board: pd.DataFrame, findings: Mapping[str, Finding], profile: str)
     parts = ["# Scoreboard", f"**{summary(board)}**", *([f"**{mark}**"] if mark else []), LEGEND]
     unlike = deviations(board, findings)
     if len(unlike):
-        columns = ["id", "what", "paper", "ours", "verdict", "note"]
+        columns = ["id", "what", "paper", "ours", "test", "p", "verdict", "note", DISCUSSED]
         parts += ["## Not as in the paper", _table(unlike, columns)]
     for notebook, rows in board.groupby("notebook"):
         columns = [name for name in COLUMNS if name not in ("notebook", "low", "high")]
@@ -196,6 +199,8 @@ def _cell(row: Mapping[str, Any], column: str) -> str:
     if column == "verdict":
         return told(row["verdict"])
     text = shown(row[column])
+    if column == DISCUSSED:
+        return f"[{text}](notebooks/{text}.ipynb)"
     if column == "ours" and row["low"] is not None:
         text += f" [{shown(row['low'])}, {shown(row['high'])}]"
     return text.replace("|", "\\|").replace("\n", " ")
