@@ -1,9 +1,10 @@
 """The whole reproduction: executes the notebooks in order and says how each went.
 
     python run_all.py [--profile full|quick|smoke] [--only NAME ...] [--workers N | --scheduler ADDRESS]
-                       [--outputs DIR] [--list]
+                       [--outputs DIR] [--runs DIR] [--list]
 
-Exit status: 0 all well, 1 a notebook failed, 2 bad input (nothing was computed), 130 interrupted.
+Exit status: 0 all well, 1 a notebook failed, 2 bad input (nothing was computed), 129, 130 or 143 interrupted by a
+closed terminal, by Ctrl-C or by SIGTERM.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import hashlib
 import json
 import logging
 import os
+import signal
 import sys
 import threading
 import time
@@ -21,12 +23,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Any, TextIO
+from unittest import mock
 
-from lt_lib.files import claimed, writable_folder
+from lt_lib.files import claimed, runs_folder, writable_folder
 from lt_lib.manifest import stages_since, write_manifest
 from lt_lib.params import ROOT, UserError, load_profile, notebook_defaults, notebook_names
-from lt_lib.preflight import check_cluster, check_inputs, settled
+from lt_lib.preflight import check_cluster, check_inputs, check_opengl, settled
 from lt_lib.progress import Progress, read_progress
 
 # Without these the later notebook can only fail too; the scoreboard joins whatever is there.
@@ -39,7 +43,11 @@ NEEDS = {
 # What this script gives to every notebook, over what the profile says.
 GIVEN = ("profile", "outputs", "workers")
 # What names things that may not exist or not fit; checked before computing.
-INPUTS = ("layout", "weights", "seeds", "gridworld", "peek_layout", "frames", "effects", "gate_file")
+INPUTS = ("device", "layout", "weights", "seeds", "gridworld", "peek_layout", "frames", "effects", "gate_file")
+# A notebook whose code calls this draws with OpenGL.
+DRAWS = "require_opengl()"
+# What ends us as Ctrl-C does; SIGHUP is a closed terminal. Not every system has it.
+SIGNALS = [number for name in ("SIGTERM", "SIGHUP") if (number := getattr(signal, name, None))]
 CELL_LIMIT_S = 6 * 3600
 
 
@@ -47,6 +55,7 @@ CELL_LIMIT_S = 6 * 3600
 class Plan:
     """What to execute, checked: notebooks in order, the parameters and the code of each, and where everything goes.
 
+    runs: the folder of finished runs
     scheduler: the address of the Dask cluster that computes, '' for this machine
     code: a digest of each notebook's code
     """
@@ -54,6 +63,7 @@ class Plan:
     root: Path
     profile: str
     outputs: Path
+    runs: Path
     scheduler: str
     parameters: Mapping[str, Mapping[str, Any]]
     code: Mapping[str, str]
@@ -79,28 +89,56 @@ class Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str], root: Path = ROOT) -> int:
     """Runs the command line for the project in `root`; returns the exit status."""
     try:
-        options = parse(arguments)
-        if options.list:
-            print("\n".join(notebook_names(root)))
-            return 0
-        plan = make_plan(options, root)
-        preflight(plan)
-        with claimed(plan.outputs):
-            outcomes = execute_all(plan)
+        with ended_by_signals():
+            return run(parse(arguments), root)
     except UserError as error:
         print(f"run_all: {error}", file=sys.stderr)
         return 2
     except OSError as error:  # a disk that fills up, a folder that becomes read-only or goes away
         print(f"run_all: {error}; finished runs are kept, the same command goes on from there", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         logging.getLogger("asyncio").disabled = True  # papermill's abandoned cell would complain at exit
-        print(
-            "run_all: interrupted; finished runs are kept, the same command goes on from there",
-            file=sys.stderr,
-        )
-        return 130
+        with contextlib.suppress(OSError):  # a closed terminal cannot be told
+            print("run_all: interrupted; finished runs are kept, the same command goes on from there", file=sys.stderr)
+        return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
+
+
+def run(options: argparse.Namespace, root: Path) -> int:
+    """Does what the options say; returns the exit status. Raises UserError before it computes."""
+    if options.list:
+        print("\n".join(notebook_names(root)))
+        return 0
+    plan = make_plan(options, root)
+    preflight(plan)
+    with claimed(plan.outputs), kernels_environment(plan):
+        outcomes = execute_all(plan)
     return 0 if all(outcome.status == "ok" for outcome in outcomes.values()) else 1
+
+
+@contextlib.contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """While the block runs, SIGTERM and SIGHUP interrupt as Ctrl-C does; a second signal ends this process at once."""
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        for each in (*SIGNALS, signal.SIGINT):
+            signal.signal(each, lambda number, _: os._exit(128 + number))
+        raise KeyboardInterrupt(number)
+
+    before = {number: signal.signal(number, interrupt) for number in (*SIGNALS, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def kernels_environment(plan: Plan) -> Iterator[None]:
+    """What notebooks find in their environment: the folder of runs, and no backend, since figures need none."""
+    with mock.patch.dict(os.environ, {"LT_RUNS": str(plan.runs)}):
+        os.environ.pop("MPLBACKEND", None)
+        yield
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -110,6 +148,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)")
     parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="a Dask cluster's, tcp://HOST:PORT")
     parser.add_argument("--outputs", type=Path, metavar="DIR", help="default: outputs/<profile>")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="of finished runs; default: outputs/runs")
     parser.add_argument("--list", action="store_true", help="name the notebooks and stop")
     options = parser.parse_args(arguments)
     if options.workers < 0:
@@ -131,6 +170,7 @@ def make_plan(options: argparse.Namespace, root: Path) -> Plan:
         root=root,
         profile=options.profile,
         outputs=Path(outputs or root / "outputs" / options.profile),
+        runs=options.runs.resolve() if options.runs else runs_folder(root),
         scheduler=options.scheduler,
         parameters={name: settled(profile[name], root) | given for name in chosen},
         code={name: code_digest(root, name) for name in chosen},
@@ -139,9 +179,12 @@ def make_plan(options: argparse.Namespace, root: Path) -> Plan:
 
 def code_digest(root: Path, name: str) -> str:
     """sha256 of a notebook's code; its prose and outputs do not count."""
+    return hashlib.sha256(json.dumps(code_cells(root, name)).encode()).hexdigest()
+
+
+def code_cells(root: Path, name: str) -> list[str]:
     cells = json.loads((root / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
-    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
-    return hashlib.sha256(json.dumps(code).encode()).hexdigest()
+    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
 def choose(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -165,11 +208,16 @@ def preflight(plan: Plan) -> None:
         if inputs not in checked:  # notebooks share most of theirs
             check_inputs(inputs, plan.root)
             checked.append(inputs)
+    if any(DRAWS in cell for name in plan.parameters for cell in code_cells(plan.root, name)):
+        check_opengl()
     if plan.scheduler:
         check_cluster(plan.scheduler)
     kept = [plan.outputs / name for name in ("logs", "notebooks", "results")]
-    for folder in (plan.outputs, *kept, plan.root / "outputs" / "runs"):
+    for folder in (plan.outputs, *kept):
         writable_folder(folder)
+    writable_folder(plan.runs, "name another by --runs")
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        print("run_all: NUMBA_DISABLE_JIT is set: loops run uncompiled, a hundred times slower", file=sys.stderr)
 
 
 def execute_all(plan: Plan) -> dict[str, Outcome]:
@@ -195,16 +243,16 @@ def execute(plan: Plan, name: str) -> Outcome:
     log = plan.outputs / "logs" / f"{name}.log"
     results = plan.outputs / "results" / f"{name}.json"
     before = results.stat().st_mtime_ns if results.exists() else None
-    journal = plan.root / "outputs" / "runs" / "journal.jsonl"
-    started, computed = time.time(), journal.stat().st_size if journal.exists() else 0
-    with log.open("w", encoding="utf-8") as file, live_line(name, plan.root / "outputs" / "runs"):
+    journal = plan.runs / "journal.jsonl"
+    started, computed = time.monotonic(), journal.stat().st_size if journal.exists() else 0
+    with log.open("w", encoding="utf-8") as file, live_line(name, plan.runs):
         reason = edited(plan, name) or run_papermill(plan, name, file)
     if not reason and (not results.exists() or results.stat().st_mtime_ns == before):
         reason = f"it ended without writing {shown(results, plan.root)}"
     reason = reason or edited(plan, name)
     if reason:
         reason = f"{reason} (log: {shown(log, plan.root)})"
-    return Outcome("FAILED" if reason else "ok", time.time() - started, reason, stages_since(journal, computed))
+    return Outcome("FAILED" if reason else "ok", time.monotonic() - started, reason, stages_since(journal, computed))
 
 
 def edited(plan: Plan, name: str) -> str:
@@ -220,6 +268,8 @@ def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
     """Executes a notebook into <outputs>/notebooks, its output into a log; returns what went wrong, or ''."""
     import papermill  # takes seconds, which bad input need not wait for
 
+    from lt_lib.kernel import OwnKernel
+
     executed = plan.outputs / "notebooks" / f"{name}.ipynb"
     try:
         # Relative paths, since papermill writes them into the executed notebook.
@@ -229,6 +279,7 @@ def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
                 shown(executed, plan.root),
                 dict(plan.parameters[name]),
                 kernel_name="python3",
+                kernel_manager_class=OwnKernel,
                 language="python",
                 progress_bar=False,
                 stdout_file=log,
@@ -272,22 +323,22 @@ def live_line(name: str, runs: Path) -> Iterator[None]:
 
 
 def tell_terminal(name: str, runs: Path, done: threading.Event) -> None:
-    started = time.time()
+    started = time.monotonic()
     while not done.wait(0.5):
-        line = describe(read_progress(runs, since=started), time.time() - started)
+        line = describe(read_progress(runs, since=started), time.monotonic() - started)
         print(f"\r{name:20}{line}\x1b[K", end="", flush=True)
     print("\r\x1b[K", end="", flush=True)
 
 
 def tell_file(name: str, runs: Path, done: threading.Event) -> None:
     """One line when a stage begins and one a minute after that."""
-    started = time.time()
+    started = time.monotonic()
     told, due = "", 0.0
     while not done.wait(0.5):
         progress = read_progress(runs, since=started)
-        if progress and (progress.what != told or time.time() > due):
-            told, due = progress.what, time.time() + 60
-            print(f"{name:20}{describe(progress, time.time() - started)}", flush=True)
+        if progress and (progress.what != told or time.monotonic() > due):
+            told, due = progress.what, time.monotonic() + 60
+            print(f"{name:20}{describe(progress, time.monotonic() - started)}", flush=True)
 
 
 def describe(progress: Progress | None, seconds: float) -> str:

@@ -19,6 +19,7 @@ from typing import Any
 import distributed
 import threadpoolctl
 
+from lt_lib.devices import computing_device
 from lt_lib.params import UserError
 from lt_lib.progress import write_fraction
 from lt_lib.runs import ONE_THREAD, Packed, Run, Submit, compute, library_versions
@@ -40,7 +41,8 @@ def code_digest() -> str:
     folder = Path(__file__).resolve().parent
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
-        digest.update(f"{path.relative_to(folder).as_posix()}\n".encode() + path.read_bytes() + b"\0")
+        text = path.read_text(encoding="utf-8")  # whatever its line ends
+        digest.update(f"{path.relative_to(folder).as_posix()}\n{text}\0".encode())
     return digest.hexdigest()[:12]
 
 
@@ -141,14 +143,24 @@ def cluster_workers(address: str, progress: Path) -> Iterator[Submit]:
 def compute_there(run: Run, key: str, expected: Mapping[str, str]) -> Packed:
     """Computes one run in a worker of a cluster.
 
-    Raises UserError if the worker has other versions, code or layouts than those the key was made with.
+    Raises UserError if the worker has other versions, code or layouts than those the key was made with, or lacks the
+    device that the key names.
     """
     worker = distributed.get_worker()
     require_same(expected, identity(), worker.address)
+    if "device" in type(run.config).model_fields:
+        _require_device(run.config.device, worker.address)
     if run.key() != key:
         raise UserError(f"worker {worker.address} has other source or another layout for {run}; bring it up to date")
     with one_thread():
         return compute(run, lambda fraction: worker.log_event(TOPIC, {"key": key, "fraction": fraction}))
+
+
+def _require_device(device: str, worker: str) -> None:
+    try:
+        computing_device(device)
+    except UserError as error:
+        raise UserError(f"worker {worker}: {error}") from None
 
 
 @contextlib.contextmanager

@@ -201,7 +201,6 @@ def layout_path(name: str) -> Path:
     return path
 
 
-Device = Literal["auto", "cpu", "cuda"]
 Share = Annotated[float, Field(ge=0, le=1)]
 Precision = Literal["float32", "bfloat16"]
 # The six direct transfers to velocity control, by what each varies (learners/transfer.py)
@@ -211,10 +210,10 @@ Configuration = Literal[
 
 
 class Training(Settings):
-    """What every training shares: the scene, and the device ('auto' is cuda where there is one)."""
+    """What every training shares: the scene, and the device that computes it."""
 
     layout: str = "default"
-    device: Device = "cpu"
+    device: Literal["cpu", "cuda"] = "cpu"
 
     @computed_field
     @property
@@ -620,5 +619,5 @@ SECTIONS: dict[str, Any] = {
     "encoder_seeds": Annotated[int, Field(ge=2)],
     "simulated": Annotated[int, Field(ge=2)],
     "effects": Annotated[list[str], Field(min_length=1)],
-    "device": Device,
+    "device": Literal["auto", "cpu", "cuda"],
 }

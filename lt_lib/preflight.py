@@ -1,10 +1,12 @@
 """What can be known to be wrong with a notebook's parameters before anything is computed."""
 
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lt_lib.params import ROOT, GridworldConfig, require_known
+from lt_lib.params import ROOT, GridworldConfig, UserError, require_known
 
 KINDS = ("encoder", "executor")  # what a weights folder holds
 
@@ -22,9 +24,13 @@ def settled(parameters: Mapping[str, Any], root: Path = ROOT) -> dict[str, Any]:
 def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
     """Raises UserError, one line, for what cannot work.
 
-    An impossible or revealing layout, unusable weights, an unknown condition or camera effect, a gate file that is
-    none, a folder of real frames with a mistake in it.
+    A device that is not there, an impossible or revealing layout, unusable weights, an unknown condition or camera
+    effect, an invalid gate file, a folder of real frames with a mistake in it.
     """
+    if "device" in parameters:
+        from lt_lib.devices import computing_device
+
+        computing_device(parameters["device"])
     if "layout" in parameters:
         from lt_lib.envs.layout import load_layout  # here, since the compiled camera takes seconds to import
         from lt_lib.envs.occlusion import require_occlusion
@@ -44,6 +50,14 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
         _check_hardware(parameters, root)
     if "gridworld" in parameters:
         _check_gridworld(parameters)
+
+
+def check_opengl() -> None:
+    """Raises UserError, one line, unless OpenGL opens here; tried in a process of its own, which a driver may end."""
+    command = [sys.executable, "-m", "lt_lib.envs.opengl"]
+    tried = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if tried.returncode:
+        raise UserError(tried.stdout.strip() or f"OpenGL ends a process that opens it (exit status {tried.returncode})")
 
 
 def check_cluster(address: str) -> None:

@@ -44,7 +44,7 @@ def stage(folder: Path, what: str, total: int) -> Iterator[tuple[Path, Callable[
     files = folder / "inflight" / str(os.getpid())
     files.mkdir(parents=True, exist_ok=True)
     _forget_ended(files.parent)
-    told = {"what": what, "done": 0, "total": total, "started": time.time()}
+    told = {"what": what, "done": 0, "total": total, "started": time.monotonic()}
 
     def finished(key: str) -> None:
         told["done"] += 1
@@ -73,14 +73,15 @@ class Progress:
 
 
 def read_progress(folder: Path, since: float) -> Progress | None:
-    """The fetch in a store that was last to start, if it was at or after `since` (seconds of the epoch)."""
-    stages = [(told["started"], path, told) for path in folder.glob("inflight/*/stage.json") if (told := _read(path))]
+    """The fetch in a store that was last to start, if it was at or after `since` (seconds of `time.monotonic`)."""
+    alive = [path for path in folder.glob("inflight/*/stage.json") if psutil.pid_exists(int(path.parent.name))]
+    stages = [(told["started"], path, told) for path in alive if (told := _read(path))]
     started, path, told = max(stages, default=(0.0, None, None), key=lambda stage: stage[0])
     if path is None or started < since:
         return None
     in_flight = [_read(run).get("fraction", 0.0) for run in path.parent.glob("*.json") if run != path]
     fraction = (told["done"] + sum(in_flight)) / told["total"]
-    seconds = time.time() - started
+    seconds = time.monotonic() - started
     left = seconds * (1 - fraction) / fraction if fraction > 0 else None
     return Progress(told["what"], told["done"], told["total"], fraction, seconds, left)
 

@@ -25,6 +25,7 @@ from typing import Any
 
 import joblib
 import numpy as np
+import psutil
 import safetensors.numpy
 from joblib.externals.loky import get_reusable_executor
 
@@ -218,7 +219,7 @@ def _end_with(parent: int, source: str) -> None:
     """Lets this worker end soon after its parent, even after one that was killed; `source` tells it from others."""
 
     def watch() -> None:
-        while os.getppid() == parent:
+        while os.getppid() == parent and psutil.pid_exists(parent):  # Windows keeps the number of a dead parent
             time.sleep(0.5)
         os._exit(1)
 

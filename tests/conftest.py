@@ -1,13 +1,10 @@
-"""Set before any test module is imported: checked array shapes, and a renderer that needs no screen."""
+"""Set before any test module is imported: checked array shapes, and one thread."""
 
 import os
 
 import jaxtyping
 import pytest
 import torch
-
-if "DISPLAY" not in os.environ:
-    os.environ.setdefault("MUJOCO_GL", "egl")
 
 torch.set_num_threads(1)  # as in a run's worker; two would fight over the cores
 

@@ -1,8 +1,13 @@
 """The scene: one layout, its physics, its cameras (Section Setup)."""
 
 import os
-import sys
 
-# MuJoCo chooses its OpenGL when it is first imported, so this must come before anything that imports it.
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")
+# MuJoCo loads OpenGL when it is first imported, though only pictures need it: `envs.opengl` opens it for those.
+_named = os.environ.get("MUJOCO_GL")
+os.environ["MUJOCO_GL"] = "disable"
+import mujoco  # noqa: F401
+
+if _named is None:
+    del os.environ["MUJOCO_GL"]
+else:
+    os.environ["MUJOCO_GL"] = _named

@@ -3,9 +3,9 @@
 Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
 """
 
-import numba
 import numpy as np
 
+from lt_lib.compiled import compiled
 from lt_lib.envs.materials import INDEX
 
 _SKY, _FLOOR, _GOAL, _ROBOT = (np.uint8(INDEX[name]) for name in ("sky", "floor", "goal", "robot"))
@@ -14,7 +14,7 @@ _FAR = np.float32(np.inf)
 _FASTMATH = {"nnan", "nsz"}  # minima and maxima may be vectorised; infinities keep their meaning
 
 
-@numba.njit(cache=True)
+@compiled()
 def expand(indices, red, green, blue, out):
     # three tables and no inner loop over channels: twice as fast
     for i in range(indices.size):
@@ -22,13 +22,13 @@ def expand(indices, red, green, blue, out):
         out[i, 0], out[i, 1], out[i, 2] = red[k], green[k], blue[k]
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _never_zero(direction):
     """A ray exactly along an axis, turned by less than float32 can tell, so that its inverse is finite."""
     return direction if direction != 0 else np.float32(1e-20)
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _row(slope, inverse_pixel, size):
     """The first row whose centre lies below a slope (rise over depth)."""
     # clipped as a float: casting an infinity to an integer is undefined
@@ -40,7 +40,7 @@ def _row(slope, inverse_pixel, size):
 # iy their inverses; a ray enters a footprint at the depth `enter` (inf if it misses it) and leaves it at `leave`.
 
 
-@numba.njit(cache=True, fastmath=_FASTMATH)
+@compiled(fastmath=_FASTMATH)
 def _nearest_walls(ox, oy, ix, iy, walls, index, nearest, colour):
     """Depth and palette index of the nearest wall in every column."""
     nearest[:] = _FAR
@@ -56,7 +56,7 @@ def _nearest_walls(ox, oy, ix, iy, walls, index, nearest, colour):
             colour[c] = (along_x if near_x >= near_y else along_y) if hit else colour[c]
 
 
-@numba.njit(cache=True, fastmath=_FASTMATH)
+@compiled(fastmath=_FASTMATH)
 def _meet_box(ox, oy, ix, iy, box, enter, leave, axis):
     """Where every column's ray meets a box, and the axis (0 x, 1 y) that the face it enters through looks along."""
     x0, x1, y0, y1 = box[0] - ox, box[1] - ox, box[2] - oy, box[3] - oy
@@ -69,7 +69,7 @@ def _meet_box(ox, oy, ix, iy, box, enter, leave, axis):
         axis[c] = near_x < near_y
 
 
-@numba.njit(cache=True, fastmath=_FASTMATH)
+@compiled(fastmath=_FASTMATH)
 def _meet_disc(ox, oy, dx, dy, cx, cy, radius, enter, leave):
     """Where every column's ray meets a disc."""
     fx, fy = ox - cx, oy - cy
@@ -82,7 +82,7 @@ def _meet_disc(ox, oy, dx, dy, cx, cy, radius, enter, leave):
         leave[c] = (-b + root) / a
 
 
-@numba.njit(cache=True)
+@compiled()
 def _paint_walls(frame, top, bottom, colour):
     for row in range(frame.shape[0]):
         line = np.int16(row)  # compared with rows of its own width
@@ -91,7 +91,7 @@ def _paint_walls(frame, top, bottom, colour):
             frame[row, c] = _SKY if line < top[c] else below
 
 
-@numba.njit(cache=True)
+@compiled()
 def _paint_objects(frame, enter, leave, axis, nearest, rise, eye, inverse):
     """Slab, goal pillar and robot over the walls, the farthest first in every column; `rise` (3,) over the eye."""
     size = np.float32(frame.shape[0])
@@ -109,7 +109,7 @@ def _paint_objects(frame, enter, leave, axis, nearest, rise, eye, inverse):
                 frame[_row(rise[k] / leave[k, c], inverse, size) : edge, c] = _SLAB_TOP if k == 0 else front
 
 
-@numba.njit(cache=True)
+@compiled()
 def draw(eyes, slabs, others, eye, tan, walls, wall_index, wall_height, slab_boxes, slab_height, goal, robot, out):
     pixels = out.shape[1]
     size = np.float32(pixels)

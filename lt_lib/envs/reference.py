@@ -6,14 +6,14 @@ from jaxtyping import Float, UInt8
 
 from lt_lib.envs.layout import OUTER_THICKNESS, Box, Layout
 from lt_lib.envs.materials import GOAL_PILLAR, INDEX, MATERIALS
-from lt_lib.params import UserError
+from lt_lib.envs.opengl import open_renderer
 
 FACE = 1e-3  # metres: walls are drawn as thin faces, one colour a direction
 SEEN, NAVIGATOR, SCOUT, FROM_ABOVE = 0, 1, 2, 3  # geom groups
 
 
 class ReferenceCamera:
-    """`mujoco.Renderer` behind the call of `FastCamera`; slow, exact, needs OpenGL (EGL or OSMesa where headless)."""
+    """`mujoco.Renderer` behind the call of `FastCamera`; slow, exact, needs OpenGL."""
 
     def __init__(self, layout: Layout, pixels: int | None = None):
         self.pixels = pixels or layout.camera.pixels
@@ -185,13 +185,3 @@ def _looking_at(*groups: int) -> mujoco.MjvOption:
     options.geomgroup[:] = 0
     options.geomgroup[list(groups)] = 1
     return options
-
-
-def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
-    """Raises UserError, one line, where there is no OpenGL."""
-    try:
-        return mujoco.Renderer(model, height, width)
-    except Exception as error:  # MuJoCo raises plain RuntimeError, FatalError or AttributeError, by platform
-        raise UserError(
-            "mujoco.Renderer found no OpenGL: install libegl1 and libgl1-mesa-dri (or libosmesa6 with MUJOCO_GL=osmesa)"
-        ) from error

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from lt_lib.envs.arena import solid
 from lt_lib.envs.bench import OBJECTS, Placements
 from lt_lib.envs.layout import Layout
-from lt_lib.envs.reference import open_renderer
+from lt_lib.envs.opengl import open_renderer
 
 TEXELS = 256
 TILE = 0.5  # metres that a texture spans
@@ -22,7 +22,7 @@ SHAPES = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtG
 
 
 class SurrogateScene:
-    """Pictures of placements, as wide as a whole frame of the camera; needs OpenGL (EGL or OSMesa where headless).
+    """Pictures of placements, as wide as a whole frame of the camera; needs OpenGL.
 
     width, height  pixels of a picture
     focal          pixels: the focal length

@@ -7,9 +7,10 @@ a time. The normals are never kept; what leaves is each window's mean command an
 Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
 """
 
-import numba
 import numpy as np
 from numpy import float32, int32, uint32
+
+from lt_lib.compiled import compiled
 
 WORDS, STREAMS = 4, 16  # the state of chance: so many words of 32 bits for each stream
 FULL = float32(1.0)  # full command
@@ -19,7 +20,7 @@ _FRACTION = int32(0x007FFFFF)
 
 
 # numba computes with 64-bit integers unless told otherwise, hence the casts
-@numba.njit(cache=True)
+@compiled()
 def _draw_bits(state, out):
     a, b, c, d = state
     for start in range(0, out.size, STREAMS):
@@ -32,7 +33,7 @@ def _draw_bits(state, out):
             d[i] = uint32(g << uint32(11)) | (g >> uint32(21))
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _split(drawn, mantissa, exponent):
     """A uniform number in (0, 1] from 24 random bits, as mantissa * 2^exponent with 1/2 <= mantissa^2 < 2."""
     bits = mantissa.view(int32)
@@ -44,7 +45,7 @@ def _split(drawn, mantissa, exponent):
         bits[i] = int32(int32(above & _FRACTION) + _ROOT_HALF)
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _log(mantissa, exponent):
     """Natural logarithm, Cephes' logf."""
     x = mantissa - float32(1)
@@ -61,7 +62,7 @@ def _log(mantissa, exponent):
     return x + (y * x * z - float32(2.12194440e-4) * exponent - float32(0.5) * z) + float32(0.693359375) * exponent
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _sine(turn):
     """Of an angle within a quarter turn of zero; Taylor's polynomial of degree 11, 6e-8 off at most."""
     x = float32(2 * np.pi) * turn
@@ -74,7 +75,7 @@ def _sine(turn):
     return x + x * z * y
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _box_muller(mantissa, exponent, drawn, first, second):
     """Two normals from a radius and an angle in the right half of the circle; a random sign makes it the whole."""
     for i in range(drawn.size):
@@ -85,7 +86,7 @@ def _box_muller(mantissa, exponent, drawn, first, second):
         second[i] = radius * sign * _sine(float32(0.25) - abs(turn))
 
 
-@numba.njit(cache=True)
+@compiled()
 def normals(seed, count):
     """`count` standard normals, float32, from a seed (WORDS, STREAMS) of random bits."""
     state, drawn, out = (
@@ -102,7 +103,7 @@ def normals(seed, count):
     return out[:count]
 
 
-@numba.njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _clamp(noise, mean, sigma, steps, means, sums):
     for b in range(mean.size):
         centre, total, drawn = float32(mean[b]), float32(0), float32(0)
@@ -112,7 +113,7 @@ def _clamp(noise, mean, sigma, steps, means, sums):
         means[b], sums[b] = total / steps, drawn
 
 
-@numba.njit(cache=True)
+@compiled()
 def clamped_windows(seeds, mean, sigma, steps):
     """Windows of so many iid commands: their means after the clamp, and the sums of their noise before it.
 

@@ -15,7 +15,7 @@ from lt_lib.learners.episodes import SLABS, draw_scenes
 from lt_lib.learners.navigator import LATERAL, Mailbox, Navigator, read_navigator
 from lt_lib.learners.noise import Ar1
 from lt_lib.params import RolloutConfig
-from lt_lib.perception.encoder import ACTION, FrozenEncoder, best_device
+from lt_lib.perception.encoder import ACTION, FrozenEncoder
 
 APPROACH = 40  # control steps before the mouths: where the bit's effect on the lateral mean is measured
 EVERY = 4  # control steps between the kept points of a path
@@ -160,7 +160,7 @@ def roll_navigator(
     imposed = Imposed(
         *(np.repeat([getattr(row, name) for row in config.rows], config.episodes) for name in Imposed._fields)
     )
-    device = best_device(config.device)
+    device = config.device
     done = play(
         started(load_layout(config.layout), config.start),
         FrozenEncoder(encoder, device, config.precision),

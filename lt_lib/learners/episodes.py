@@ -15,7 +15,7 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.learners.executor import ROUTES, FrozenExecutor
 from lt_lib.params import BankConfig
-from lt_lib.perception.encoder import FrozenEncoder, best_device
+from lt_lib.perception.encoder import FrozenEncoder
 
 SLABS = 2
 ARRIVAL_REWARD = 1.0
@@ -112,7 +112,7 @@ def roll_bank(
     executor: Mapping[str, np.ndarray],
 ) -> dict:
     """Every outcome of `entries` draws of the scene: arrays (entries, slab, route), and the draws (entries, 3)."""
-    layout, device = load_layout(config.layout), best_device(config.device)
+    layout, device = load_layout(config.layout), config.device
     draws = draw_scenes(layout, config.entries, np.random.default_rng([seed, 2]))
     shape = (config.entries, SLABS, ROUTES)
     entry, slab, route = (axis.ravel() for axis in np.indices(shape))

@@ -18,7 +18,7 @@ from lt_lib.envs.geodesic import RouteDistance
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.learners import ppo
 from lt_lib.params import ExecutorConfig
-from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder, best_device
+from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 
 ROUTES = 2
@@ -147,7 +147,7 @@ def train_executor(
     "curve.*" have one entry an update: obedient share of the episodes that ended, their number, entropy.
     """
     rng = np.random.default_rng([seed, 1])
-    device = best_device(config.device)
+    device = config.device
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         policy = Executor().to(device)

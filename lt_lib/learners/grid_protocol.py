@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.grid_wires import GRID_CONTENTS
+from lt_lib.files import runs_folder
 from lt_lib.learners.grid_episodes import evaluate_grid
 from lt_lib.learners.mappo import train_grid
 from lt_lib.params import (
-    ROOT,
     GridConfig,
     GridEvaluationConfig,
     GridworldConfig,
@@ -40,7 +40,7 @@ class GridProtocol:
         section = GridworldConfig(**gridworld)
         there = {"layout": section.layout}
         return cls(
-            RunStore(ROOT / "outputs" / "runs", workers),
+            RunStore(runs_folder(), workers),
             section.encoder.model_copy(update=there),
             section.gates,
             section.policy.model_copy(update=there),

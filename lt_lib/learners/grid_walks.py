@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from lt_lib.compiled import compiled
 from lt_lib.envs.gridworld import GOAL_REWARD, HORIZON, MOVES, SLAB_REWARD, STEP_REWARD, Grid
 from lt_lib.envs.layout import SIDES
 
@@ -72,7 +72,7 @@ def walk(
     return Walks(reward=reward, terminated=terminated, ended=ended, arrived=arrived, **integers), States(*last)
 
 
-@njit(cache=True)
+@compiled()
 def _walk(cumulative, following, slab_cells, goal, spawn, posts, states, uniform):
     steps, n = uniform.shape[:2]
     out, states = np.empty((6, steps, n), np.int64), states.copy()

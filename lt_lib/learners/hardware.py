@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from lt_lib.devices import computing_device
 from lt_lib.envs.layout import load_layout
+from lt_lib.files import runs_folder
 from lt_lib.learners.executor import ROUTES, FrozenExecutor, train_executor
 from lt_lib.params import (
     ROOT,
@@ -20,7 +22,7 @@ from lt_lib.params import (
     SessionsConfig,
     SweepConfig,
 )
-from lt_lib.perception.encoder import FrozenEncoder, best_device
+from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.gates import encode
 from lt_lib.perception.matched import PictureEncoder, measure_matched_gates, train_matched_encoder
@@ -62,10 +64,10 @@ class HardwareProtocol:
             "executor": ExecutorConfig,
             "rails": RailsConfig,
         }
-        shared = {"device": device, "layout": "matched"}
+        shared = {"device": computing_device(device), "layout": "matched"}
         configs = {name: kinds[name](**shared, **sections.pop(name)) for name in kinds}
         return cls(
-            RunStore(ROOT / "outputs" / "runs", workers),
+            RunStore(runs_folder(), workers),
             gates,
             **configs,
             sessions=SessionsConfig(**sections["sessions"]),
@@ -116,7 +118,7 @@ class HardwareProtocol:
         """Both probes of each encoder; all of them were trained in the appearances of the candidate `looks`."""
         simulated = self.simulated_bench(looks)
         return {
-            name: transfer(PictureEncoder(encoder, best_device(self.matched.device)), simulated, sessions)
+            name: transfer(PictureEncoder(encoder, self.matched.device), simulated, sessions)
             for name, encoder in encoders.items()
         }
 
@@ -145,7 +147,7 @@ class HardwareProtocol:
 
 def past_the_rails(config: RailsConfig, encoder: Result, executor: Result) -> Float[np.ndarray, "routes axes"]:
     """Share of an executor's action components beyond +-1 before clipping, on frames of held-out rollouts."""
-    device = best_device(config.device)
+    device = config.device
     rng = np.random.default_rng([SEED, 13])
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
     latents = torch.from_numpy(encode(FrozenEncoder(encoder, device), rollouts.frames)).flatten(0, 1).to(device)

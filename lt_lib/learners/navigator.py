@@ -22,7 +22,7 @@ from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.learners import ppo
 from lt_lib.learners.noise import Ar1
 from lt_lib.params import Boost, NavigatorConfig
-from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder, best_device
+from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 
 WIRE = ANCHOR + CONTENT
@@ -188,7 +188,7 @@ def train_navigator(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         navigator = read_navigator(start) if start else Navigator()
-    errand = Errand(config, FrozenEncoder(encoder, best_device(config.device), config.precision), rng)
+    errand = Errand(config, FrozenEncoder(encoder, config.device, config.precision), rng)
     chains = Ar1(np.full(config.envs, config.boost.tau), rng)
     optimiser = torch.optim.Adam(navigator.parameters(), lr=config.lr, eps=1e-5)
     updates = max(1, config.steps // (config.rollout * config.envs))

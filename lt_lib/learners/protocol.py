@@ -11,7 +11,9 @@ import numpy as np
 
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.messages import CONDITIONS
+from lt_lib.devices import computing_device
 from lt_lib.envs.layout import load_layout
+from lt_lib.files import runs_folder
 from lt_lib.learners.episodes import ROUTES, roll_bank
 from lt_lib.learners.executor import train_executor
 from lt_lib.learners.redraw import REDRAWS, train_redrawn_head
@@ -62,13 +64,13 @@ class Protocol:
         cls, layout: str, device: str, workers: int | str, weights: str = "", shards: int = 8, **sections: Mapping
     ) -> "Protocol":
         """From a notebook's parameters: `sections` are the dicts named as in params.SECTIONS."""
-        shared = {"layout": layout, "device": device}
+        shared = {"layout": layout, "device": computing_device(device)}
         configs = {
             name: SECTIONS[name](**(shared if issubclass(SECTIONS[name], Training) else {}), **values)
             for name, values in sections.items()
         }
         folder = ROOT / weights if weights else None
-        return cls(RunStore(ROOT / "outputs" / "runs", workers), shards=shards, weights=folder, **configs)
+        return cls(RunStore(runs_folder(), workers), shards=shards, weights=folder, **configs)
 
     def encoders(self) -> dict[str, Result]:
         """Ours, and what it must beat at the gates: an untrained one, and one trained by prediction alone."""

@@ -23,7 +23,7 @@ from lt_lib.learners import ppo
 from lt_lib.learners.episodes import ARRIVAL_REWARD, CONTACT_REWARD, SLABS, Draws, Outcomes
 from lt_lib.learners.executor import FrozenExecutor
 from lt_lib.params import PpoConfig, RedrawConfig
-from lt_lib.perception.encoder import FrozenEncoder, best_device
+from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.renewal import renew
 
 
@@ -105,7 +105,7 @@ class LiveArena:
     """Navigators that the frozen executor drives, and the scouts' messages to them, `config.envs` side by side."""
 
     def __init__(self, config: RedrawConfig, encoder: Mapping[str, np.ndarray], executor: Mapping[str, np.ndarray]):
-        device = best_device(config.device)
+        device = config.device
         self._layout, self._config = load_layout(config.layout), config
         self._arena, self._camera = Arena(self._layout, config.envs), FastCamera(self._layout)
         self._encoder = FrozenEncoder(encoder, device, config.precision)

@@ -20,7 +20,7 @@ from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.learners import ppo
 from lt_lib.learners.episodes import SLABS, Outcomes
 from lt_lib.params import EvaluationConfig, HeadConfig
-from lt_lib.perception.encoder import FrozenEncoder, best_device
+from lt_lib.perception.encoder import FrozenEncoder
 
 CHUNK = 1024  # frames encoded at a time
 
@@ -61,7 +61,7 @@ def read_bank(
     config: HeadConfig | EvaluationConfig, bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]
 ) -> tuple[Bank, Bank]:
     """The bank's training draws and its held-out draws, with the wires of the configured content."""
-    layout, frozen = load_layout(config.layout), FrozenEncoder(encoder, best_device(config.device))
+    layout, frozen = load_layout(config.layout), FrozenEncoder(encoder, config.device)
     wires = sent_wires(layout, frozen, config.content, bank["spawn"], bank["scout"])
     whole = Bank(wires, Outcomes(**{name: bank[name] for name in Outcomes._fields}))
     held_out = int(len(wires) * config.held_out)

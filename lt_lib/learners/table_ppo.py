@@ -10,9 +10,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Int
-from numba import njit
 from torch import Tensor
 
+from lt_lib.compiled import compiled
 from lt_lib.learners import ppo
 from lt_lib.params import PpoConfig
 
@@ -68,7 +68,7 @@ def _weights(config: PpoConfig) -> tuple[float, float, float]:
     return config.clip, ppo.VALUE_COEFFICIENT, config.entropy
 
 
-@njit(cache=True)
+@compiled()
 def _gradient(log_probs, values, rows, actions, old, advantages, returns, clip, value_weight, entropy_weight):
     """Of the PPO loss in both tables, and its parts: policy loss, value loss, entropy, share of ratios clipped."""
     by_log_prob, by_value, n = np.zeros_like(log_probs), np.zeros_like(values), len(actions)

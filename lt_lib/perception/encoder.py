@@ -115,8 +115,3 @@ def in_chunks(encode: Callable[[np.ndarray], Tensor], observations: np.ndarray) 
     """What `encode` makes of n observations, CHUNK at a time, so that memory does not grow with n."""
     parts = [encode(observations[i : i + CHUNK]).cpu() for i in range(0, len(observations), CHUNK)]
     return torch.cat(parts).numpy()
-
-
-def best_device(name: str) -> str:
-    """'auto' is cuda where there is one, else cpu."""
-    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name

@@ -16,7 +16,7 @@ from sklearn.manifold import TSNE
 
 from lt_lib.envs.layout import load_layout
 from lt_lib.params import GateConfig, Gates, UserError
-from lt_lib.perception.encoder import LATENT, FrozenEncoder, best_device, in_chunks
+from lt_lib.perception.encoder import LATENT, FrozenEncoder, in_chunks
 from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixels
 
 PROBE_SHARE = 0.7  # of the held-out rollouts train the probes, the rest test them
@@ -60,7 +60,7 @@ def measure_gates(
     """
     rng = np.random.default_rng([seed, 5])
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
-    latents = encode(FrozenEncoder(encoder, best_device(config.device)), rollouts.frames)  # (R, T, 64)
+    latents = encode(FrozenEncoder(encoder, config.device), rollouts.frames)  # (R, T, 64)
     report(0.5)
     visible, walls = hazard_visible(rollouts.frames), wall_pixels(rollouts.frames)
     cut = int(len(latents) * PROBE_SHARE)

@@ -14,7 +14,7 @@ from lt_lib.envs.camera import network_input
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.materials import PALETTE
 from lt_lib.params import EncoderConfig
-from lt_lib.perception.encoder import Encoder, best_device, in_chunks
+from lt_lib.perception.encoder import Encoder, in_chunks
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 
@@ -37,7 +37,7 @@ def train_encoder(config: EncoderConfig, seed: int, *, report: Callable[[float],
     rng = np.random.default_rng([seed, 0])
     rollouts = random_rollouts(load_layout(config.layout), config.frames // config.rollout, config.rollout, rng)
     classes = colour_classes().astype(np.int16)[cells(rollouts.frames)]
-    device = best_device(config.device)
+    device = config.device
     with torch.random.fork_rng(devices=[]):  # module initialisation draws from torch's global generator
         torch.manual_seed(seed)
         model = Jepa(Encoder(), class_weights(classes, int(classes.max()) + 1), GRID).to(device)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lt_lib.envs.layout import load_layout
 from lt_lib.params import HardwareGates, MatchedEncoderConfig, MatchedGateConfig, UserError
-from lt_lib.perception.encoder import LATENT, Encoder, Frozen, best_device, in_chunks
+from lt_lib.perception.encoder import LATENT, Encoder, Frozen, in_chunks
 from lt_lib.perception.frames import Rollouts, hazard_visible, random_rollouts, wall_pixels
 from lt_lib.perception.gates import PROBE_SHARE, effective_rank
 from lt_lib.perception.jepa import GRID, LEVELS
@@ -58,7 +58,7 @@ def train_matched_encoder(config: MatchedEncoderConfig, seed: int, *, report: Ca
     rollouts = random_rollouts(layout, config.frames // config.rollout, config.rollout, rng)
     looks = draw_appearances(len(rollouts.frames), layout.camera.pixels, config.colour, config.texture, rng)
     sample = _sample(rollouts, looks, rng)
-    device = best_device(config.device)
+    device = config.device
     with torch.random.fork_rng(devices=[]):  # module initialisation draws from torch's global generator
         torch.manual_seed(seed)
         model = Jepa(Encoder(), class_weights(colour_codes(sample), LEVELS**3), GRID).to(device)
@@ -98,7 +98,7 @@ def measure_matched_gates(
     layout = load_layout(config.layout)
     rollouts = random_rollouts(layout, config.rollouts, config.length, rng)
     looks = draw_appearances(config.rollouts, layout.camera.pixels, config.colour, config.texture, rng)
-    network = PictureEncoder(encoder, best_device(config.device))
+    network = PictureEncoder(encoder, config.device)
     latents = np.empty((config.rollouts, config.length, LATENT))
     for t in range(config.length):
         latents[:, t] = network.latents(eight_bits(recoloured(rollouts.frames[:, t], looks)))

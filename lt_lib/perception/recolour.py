@@ -3,11 +3,12 @@
 Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
 """
 
-import numba
 import numpy as np
 
+from lt_lib.compiled import compiled
 
-@numba.njit(cache=True)
+
+@compiled()
 def paint(indices, palettes, textures, textured, out):
     one = np.float32(1)
     for b in range(indices.shape[0]):

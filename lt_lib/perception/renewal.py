@@ -3,10 +3,10 @@
 Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
 """
 
-import numba
+from lt_lib.compiled import compiled
 
 
-@numba.njit(cache=True)
+@compiled()
 def renew(kept, rows, frames, new):
     """Puts each of the frames (B, words) into its row of `kept` where it is new, and says in `new` (B,) where it is."""
     for b in range(frames.shape[0]):

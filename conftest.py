@@ -1,0 +1,42 @@
+"""How pytest runs the notebooks: with this checkout's library, and told at once when a kernel dies."""
+
+import os
+from pathlib import Path
+from queue import Empty
+
+from nbval.kernel import RunningKernel
+
+ROOT = Path(__file__).resolve().parent
+LOOK_S = 2  # between looks at whether a kernel that says nothing is still alive
+
+# Kernels start in notebooks/, where the environment may know another checkout's library.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+os.environ.pop("MPLBACKEND", None)  # figures need none, so that an unknown one does not matter
+
+
+def pytest_report_header() -> list[str]:
+    slow = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
+    return ["NUMBA_DISABLE_JIT is set: loops run uncompiled, a hundred times slower"] if slow else []
+
+
+class WatchedKernel(RunningKernel):
+    """A kernel of nbval's, which would wait for a dead one's answer until the cell's time is over."""
+
+    def get_message(self, stream, timeout=None):
+        waited = 0.0
+        while True:
+            step = LOOK_S if timeout is None else min(LOOK_S, timeout - waited)
+            try:
+                return super().get_message(stream, step)
+            except Empty:
+                waited += step
+                if not self.is_alive():
+                    raise RuntimeError("the kernel died in this cell") from None
+                if timeout is not None and waited >= timeout:
+                    raise
+
+
+def pytest_configure() -> None:
+    from nbval import plugin
+
+    plugin.RunningKernel = WatchedKernel
