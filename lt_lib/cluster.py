@@ -149,14 +149,15 @@ def compute_there(run: Run, key: str, expected: Mapping[str, str]) -> Packed:
     worker = distributed.get_worker()
     require_same(expected, identity(), worker.address)
     if "device" in type(run.config).model_fields:
-        _require_device(run.config.device, worker.address)
+        require_device(run.config.device, worker.address)
     if run.key() != key:
         raise UserError(f"worker {worker.address} has other source or another layout for {run}; bring it up to date")
     with one_thread():
         return compute(run, lambda fraction: worker.log_event(TOPIC, {"key": key, "fraction": fraction}))
 
 
-def _require_device(device: str, worker: str) -> None:
+def require_device(device: str, worker: str) -> None:
+    """Raises UserError, naming the worker that this process is, if it lacks a device."""
     try:
         computing_device(device)
     except UserError as error:

@@ -180,7 +180,7 @@ def test_a_worker_that_finds_other_source_than_the_key_s_does_not_compute(small_
 
 def fetch_in_the_background(folder: Path, small_cluster: Cluster, runs: list[Run]) -> Future:
     """A fetch, once one of its runs tells that it is in the middle."""
-    since = time.time()
+    since = time.monotonic()
     future = ThreadPoolExecutor(1).submit(RunStore(folder, small_cluster.address).fetch, runs, "toys")
     wait_until(lambda: (now := read_progress(folder, since)) and now.fraction > now.done / now.total, LIMIT_S)
     return future

@@ -306,9 +306,12 @@ def test_killed_in_the_middle_it_goes_on_without_repeating_a_finished_run(projec
     assert losses(project, "02_encoder") == undisturbed
 
 
-def test_interrupted_it_says_so_and_leaves_nothing_running(project):
-    process = end_in_the_middle(project, signal.SIGINT)
-    assert process.returncode == 130
+@pytest.mark.parametrize(
+    ("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)], ids=["INT", "TERM", "HUP"]
+)
+def test_interrupted_it_says_so_and_leaves_nothing_running(project, how, status):
+    process = end_in_the_middle(project, how)
+    assert process.returncode == status
     (line,) = process.stderr.read().splitlines()
     assert line.startswith("run_all: interrupted; finished runs are kept")
 

@@ -269,7 +269,7 @@ def test_an_unwritable_folder_is_one_line(tmp_path):
 
 
 def test_progress_counts_finished_runs_and_parts_of_those_in_flight(tmp_path):
-    since = time.time()
+    since = time.monotonic()
     with stage(tmp_path, "toys", total=4) as (folder, finished):
         Reporter(partial(write_fraction, folder / "one.json"))(0.9)
         finished("one")
@@ -279,7 +279,7 @@ def test_progress_counts_finished_runs_and_parts_of_those_in_flight(tmp_path):
         assert (progress.what, progress.done, progress.total) == ("toys", 1, 4)
         assert progress.fraction == pytest.approx(1.5 / 4)
         assert progress.left == pytest.approx(progress.seconds * 2.5 / 1.5)
-        assert read_progress(tmp_path, since=time.time()) is None
+        assert read_progress(tmp_path, since=time.monotonic()) is None
     assert read_progress(tmp_path, since) is None
 
 

@@ -24,8 +24,9 @@ toy = {}"""
 COMPUTE = """import json
 from pathlib import Path
 from toy_runs import ToyConfig, train_toy
+from lt_lib.files import runs_folder
 from lt_lib.runs import Run, RunStore
-store = RunStore(Path("outputs/runs"), workers)
+store = RunStore(runs_folder(Path(".")), workers)
 results = store.fetch([Run(train_toy, ToyConfig(**toy), seed) for seed in range(count)], "toys")"""
 
 WRITE = """path = Path(outputs or f"outputs/{profile}") / "results" / "NAME.json"
@@ -51,9 +52,7 @@ def losses(root: Path, name: str) -> list[float]:
     return json.loads((root / "outputs" / "smoke" / "results" / f"{name}.json").read_text())
 
 
-# Where the tests run in the background of a shell, SIGINT is ignored, and would be here too.
-START = """import pathlib, run_all, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)
+START = """import pathlib, run_all, sys
 sys.exit(run_all.main(sys.argv[2:], pathlib.Path(sys.argv[1])))"""
 
 
