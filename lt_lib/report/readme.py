@@ -1,5 +1,6 @@
 """Writes the headline table of the committed full run into README.md: `python -m lt_lib.report.readme`."""
 
+import json
 import re
 from pathlib import Path
 
@@ -17,7 +18,20 @@ def refreshed(text: str, outputs: Path = FULL) -> str:
     claims = load_claims()
     board = join(claims, read_findings(outputs, claims, "full"), "full")
     table = f"Route optimality by message content (Table III), mean over seeds [95% interval]:\n\n{headline(board)}\n\n"
-    return BLOCK.sub(lambda found: f"{found[1]}{table}All claims: {summary(board)}.\n{found[2]}", text)
+    sums = f"All claims: {summary(board)}. {computed_by(outputs)}\n"
+    return BLOCK.sub(lambda found: f"{found[1]}{table}{sums}{found[2]}", text)
+
+
+def computed_by(outputs: Path) -> str:
+    """Which source computed an outputs folder, with which torch, on what: its manifest in a sentence."""
+    manifest = json.loads((outputs / "manifest.json").read_text(encoding="utf-8"))
+    commits = dict.fromkeys(entry["commit"][:7] for entry in manifest["notebooks"].values())
+    source = f"commit{'s' if len(commits) > 1 else ''} {', '.join(commits)}"
+    versions, machine = manifest["versions"], manifest["machine"]
+    return (
+        f"Computed at {source} with Python {versions['python']} and torch {versions['torch']}, "
+        f"on {machine['cores']} cores ({machine['cpu']}, {machine['system']})."
+    )
 
 
 if __name__ == "__main__":
