@@ -27,11 +27,12 @@ from types import FrameType
 from typing import Any, TextIO
 from unittest import mock
 
-from lt_lib.files import claimed, runs_folder, writable_folder
-from lt_lib.manifest import stages_since, write_manifest
-from lt_lib.params import ROOT, UserError, load_profile, notebook_defaults, notebook_names
 from lt_lib.preflight import check_cluster, check_inputs, check_opengl, settled
-from lt_lib.progress import Progress, read_progress
+from lt_lib.settings.base import ROOT, UserError
+from lt_lib.settings.profiles import load_profile, notebook_defaults, notebook_names
+from lt_lib.store.files import claimed, runs_folder, writable_folder
+from lt_lib.store.manifest import stages_since, write_manifest
+from lt_lib.store.progress import Progress, read_progress
 
 # Without these the later notebook can only fail too; the scoreboard joins whatever is there.
 NEEDS = {
@@ -268,7 +269,7 @@ def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
     """Executes a notebook into <outputs>/notebooks, its output into a log; returns what went wrong, or ''."""
     import papermill  # takes seconds, which bad input need not wait for
 
-    from lt_lib.kernel import OwnKernel
+    from lt_lib.store.kernel import OwnKernel
 
     executed = plan.outputs / "notebooks" / f"{name}.ipynb"
     try:

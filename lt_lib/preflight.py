@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lt_lib.params import ROOT, GridworldConfig, UserError, require_known
+from lt_lib.settings.base import ROOT, UserError, require_known
+from lt_lib.settings.gridworld import GridworldConfig
 
 KINDS = ("encoder", "executor")  # what a weights folder holds
 
@@ -28,7 +29,7 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
     effect, an invalid gate file, a folder of real frames with a mistake in it.
     """
     if "device" in parameters:
-        from lt_lib.devices import computing_device
+        from lt_lib.settings.devices import computing_device
 
         computing_device(parameters["device"])
     if "layout" in parameters:
@@ -43,7 +44,7 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
                 load_frozen(root / parameters["weights"], kind, layout)
     if "seeds" in parameters:
         from lt_lib.comm.messages import CONDITIONS
-        from lt_lib.learners.redraw import REDRAWS
+        from lt_lib.pixels.redraw import REDRAWS
 
         require_known(parameters["seeds"], (*CONDITIONS, *REDRAWS), "message condition", "seeds: ")
     if "effects" in parameters:
@@ -62,16 +63,16 @@ def check_opengl() -> None:
 
 def check_cluster(address: str) -> None:
     """Raises UserError, one line, unless a scheduler with workers of our versions answers at an address."""
-    from lt_lib.cluster import connected  # here, since Dask takes a second to import
+    from lt_lib.store.cluster import connected  # here, since Dask takes a second to import
 
     with connected(address):
         pass
 
 
 def _check_hardware(parameters: Mapping[str, Any], root: Path) -> None:
-    from lt_lib.perception.real_frames import read_sessions
-    from lt_lib.perception.sessions import EFFECTS
-    from lt_lib.report.registration import read_gates
+    from lt_lib.hardware.real_frames import read_sessions
+    from lt_lib.hardware.registration import read_gates
+    from lt_lib.hardware.sessions import EFFECTS
 
     require_known(parameters["effects"], EFFECTS, "camera effect", "effects: ")
     read_gates(root / parameters["gate_file"])
@@ -80,10 +81,9 @@ def _check_hardware(parameters: Mapping[str, Any], root: Path) -> None:
 
 
 def _check_gridworld(parameters: Mapping[str, Any]) -> None:
-    from lt_lib.comm.grid_wires import GRID_CONTENTS
-    from lt_lib.envs.gridworld import Grid
     from lt_lib.envs.layout import load_layout
-    from lt_lib.envs.occlusion import require_occluded_choices
+    from lt_lib.gridworld.map import Grid, require_occluded_choices
+    from lt_lib.gridworld.wires import GRID_CONTENTS
 
     gridworld = GridworldConfig(**parameters["gridworld"])
     require_occluded_choices(Grid(load_layout(gridworld.layout)))

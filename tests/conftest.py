@@ -9,10 +9,10 @@ import torch
 torch.set_num_threads(1)  # as in a run's worker; two would fight over the cores
 
 import lt_lib.envs.raycast  # compiled code, imported before the checks so that they leave it alone
-import lt_lib.envs.windows
-import lt_lib.learners.grid_walks
-import lt_lib.learners.table_ppo
-import lt_lib.perception.recolour
+import lt_lib.gridworld.table_ppo
+import lt_lib.gridworld.walks
+import lt_lib.hardware.recolour
+import lt_lib.learnability.windows
 import lt_lib.perception.renewal  # noqa: F401
 
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")
@@ -24,7 +24,7 @@ def project(tmp_path, monkeypatch):
     from toy_project import COMPUTE, WRITE, write_notebook
     from toy_runs import ToyConfig
 
-    from lt_lib import params
+    from lt_lib.settings import base, profiles
 
     root = tmp_path / "project"
     for folder in ("notebooks", "params"):
@@ -34,6 +34,6 @@ def project(tmp_path, monkeypatch):
     (root / "params" / "smoke.yaml").write_text("shared: {count: 2}\n02_encoder: {toy: {size: 5}}\n")
     (root / "params" / "claims.yaml").write_text("")
     (root / "requirements.txt").write_text("numpy==2\n")
-    monkeypatch.setenv("PYTHONPATH", f"{params.ROOT}{os.pathsep}{params.ROOT / 'tests'}")
-    monkeypatch.setitem(params.SECTIONS, "toy", ToyConfig)
+    monkeypatch.setenv("PYTHONPATH", f"{base.ROOT}{os.pathsep}{base.ROOT / 'tests'}")
+    monkeypatch.setitem(profiles.SECTIONS, "toy", ToyConfig)
     return root

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from lt_lib.report import benchmarks
-from lt_lib.timing import taking_turns
+from lt_lib.speed import benchmarks
+from lt_lib.speed.turns import taking_turns
 
 
 def test_turns_alternate_and_the_first_round_is_not_counted():

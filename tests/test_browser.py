@@ -14,9 +14,9 @@ from urllib.parse import unquote, urlparse
 import nbformat
 import pytest
 
-from lt_lib.params import ROOT
 from lt_lib.report.html import PICTURES, main, write_report
 from lt_lib.report.readme import FULL
+from lt_lib.settings.base import ROOT
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 LIMIT_S = 600

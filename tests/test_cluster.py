@@ -15,10 +15,11 @@ import pytest
 from toy_project import LIMIT_S, journal, kept_files, losses, wait_until
 from toy_runs import ToyConfig, count_threads, train_toy
 
-from lt_lib import cluster
-from lt_lib.params import ROOT, UserError
-from lt_lib.progress import read_progress
-from lt_lib.runs import Run, RunError, RunStore
+from lt_lib.settings.base import ROOT, UserError
+from lt_lib.store import cluster
+from lt_lib.store.progress import read_progress
+from lt_lib.store.run import Run
+from lt_lib.store.runs import RunError, RunStore
 from run_all import main
 
 
@@ -169,7 +170,7 @@ def test_code_edited_after_a_process_began_is_told(monkeypatch):
 
 
 def test_a_worker_that_finds_other_source_than_the_key_s_does_not_compute(small_cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr("lt_lib.runs.source_digest", lambda *_, folder: "other")
+    monkeypatch.setattr("lt_lib.store.run.source_digest", lambda *_, folder: "other")
     with pytest.raises(RunError, match="other source or another layout for train_toy"):
         RunStore(tmp_path, small_cluster.address).fetch(toys(1), "toys")
     assert not kept_files(tmp_path)

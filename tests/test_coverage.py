@@ -8,16 +8,16 @@ from scipy.stats import spearmanr
 from lt_lib.comm.channel import ANCHOR
 from lt_lib.envs.arena import NO_CORRIDOR, Arena
 from lt_lib.envs.layout import load_layout
-from lt_lib.learners.coverage import Imposed, explore, play, started
-from lt_lib.learners.diagnostics import command_error, message_error
-from lt_lib.learners.episodes import draw_scenes
-from lt_lib.learners.navigator import LATERAL, Errand, Mailbox, Navigator, annealed, train_navigator
-from lt_lib.learners.noise import Ar1
-from lt_lib.learners.transfer import BOOSTS, DIRECT, OTHERS
-from lt_lib.params import Boost, Configuration, NavigatorConfig, RolloutConfig
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
-from lt_lib.report import coverage, transfer
+from lt_lib.pixels.episodes import draw_scenes
 from lt_lib.report.claims import load_claims
+from lt_lib.settings.velocity import Boost, Configuration, NavigatorConfig, RolloutConfig
+from lt_lib.velocity import coverage_figures as coverage, transfer_figures as transfer
+from lt_lib.velocity.coverage import Imposed, explore, play, started
+from lt_lib.velocity.diagnostics import command_error, message_error
+from lt_lib.velocity.navigator import LATERAL, Errand, Mailbox, Navigator, annealed, train_navigator
+from lt_lib.velocity.noise import Ar1
+from lt_lib.velocity.transfer import BOOSTS, DIRECT, OTHERS
 
 LAYOUT = load_layout("default")
 FOUR_SDS = 4.0  # of a Monte-Carlo estimate

@@ -10,16 +10,16 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from lt_lib.comm.channel import LATENCY, deliver
 from lt_lib.comm.messages import CONTENT
-from lt_lib.comm.team import NAVIGATOR, SCOUT, TeamEnv
-from lt_lib.envs import gym
+from lt_lib.environments import gym
+from lt_lib.environments.gym import ArenaEnv, ArenaVectorEnv
+from lt_lib.environments.team import NAVIGATOR, SCOUT, TeamEnv
 from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena
 from lt_lib.envs.camera import FastCamera, colours
-from lt_lib.envs.gym import ArenaEnv, ArenaVectorEnv
 from lt_lib.envs.layout import load_layout
-from lt_lib.learners import episodes
-from lt_lib.params import UserError
+from lt_lib.pixels import episodes
+from lt_lib.settings.base import UserError
 
-ID = "lt_lib.envs.gym:LatentTelepathy/Corridors-v0"
+ID = "lt_lib.environments.gym:LatentTelepathy/Corridors-v0"
 ONE = np.ones(1, bool)
 
 

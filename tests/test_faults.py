@@ -20,11 +20,12 @@ import pytest
 from toy_project import COMPUTE, LIMIT_S, PARAMETERS, WRITE, journal, kept_files, losses, smoke, write_notebook
 from toy_runs import ToyConfig, train_toy
 
-from lt_lib.files import claimed
-from lt_lib.manifest import write_manifest
-from lt_lib.params import UserError
-from lt_lib.progress import Reporter, stage, write_fraction
-from lt_lib.runs import Run, RunError, RunStore
+from lt_lib.settings.base import UserError
+from lt_lib.store.files import claimed
+from lt_lib.store.manifest import write_manifest
+from lt_lib.store.progress import Reporter, stage, write_fraction
+from lt_lib.store.run import Run
+from lt_lib.store.runs import RunError, RunStore
 from run_all import code_digest
 
 
@@ -191,7 +192,7 @@ def test_a_second_run_all_on_one_outputs_folder_is_refused_by_the_first_one_s_nu
 
 def test_a_killed_process_claims_nothing(tmp_path):
     hold = """import pathlib, sys, time
-from lt_lib.files import claimed
+from lt_lib.store.files import claimed
 with claimed(pathlib.Path(sys.argv[1])):
     print(1, flush=True)
     time.sleep(60)"""

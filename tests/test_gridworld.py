@@ -10,35 +10,34 @@ import torch
 import yaml
 from pydantic import ValidationError
 
+from lt_lib import ppo
 from lt_lib.comm.channel import CORRUPTIONS
-from lt_lib.comm.grid_wires import GRID_CONTENTS, contents_sent
 from lt_lib.comm.receiver import Receiver
-from lt_lib.envs.gridworld import GOAL_REWARD, HAZARD, HORIZON, PATCH, SLAB_REWARD, STEP_REWARD, WALL, Grid
 from lt_lib.envs.layout import load_layout
-from lt_lib.envs.shadowcast import field_of_view
-from lt_lib.learners import ppo, table_ppo
-from lt_lib.learners.grid_episodes import evaluate_grid, rerouted
-from lt_lib.learners.grid_protocol import GridProtocol
-from lt_lib.learners.grid_walks import first_states, walk
-from lt_lib.learners.mappo import Actor, Inputs, TableTeam, Team, batch, train_grid
-from lt_lib.params import (
+from lt_lib.gridworld import corruption as grid_corruption, table_ppo
+from lt_lib.gridworld.episodes import evaluate_grid, rerouted
+from lt_lib.gridworld.map import GOAL_REWARD, HAZARD, HORIZON, PATCH, SLAB_REWARD, STEP_REWARD, WALL, Grid
+from lt_lib.gridworld.mappo import Actor, Inputs, TableTeam, Team, batch, train_grid
+from lt_lib.gridworld.patch_gates import measure_patch_gates, require_patch_gates
+from lt_lib.gridworld.patches import FrozenPatchEncoder, random_walks, train_patch_encoder
+from lt_lib.gridworld.protocol import GridProtocol
+from lt_lib.gridworld.shadowcast import field_of_view
+from lt_lib.gridworld.walks import first_states, walk
+from lt_lib.gridworld.wires import GRID_CONTENTS, contents_sent
+from lt_lib.perception.gates import GateError
+from lt_lib.preflight import check_inputs
+from lt_lib.settings.base import UserError, layout_path
+from lt_lib.settings.gridworld import (
     GridConfig,
     GridEvaluationConfig,
     GridworldConfig,
     PatchEncoderConfig,
     PatchGateConfig,
     PatchGates,
-    PpoConfig,
-    UserError,
-    explain,
-    layout_path,
-)  # fmt: skip
-from lt_lib.perception.gates import GateError
-from lt_lib.perception.patch_gates import measure_patch_gates, require_patch_gates
-from lt_lib.perception.patches import FrozenPatchEncoder, random_walks, train_patch_encoder
-from lt_lib.preflight import check_inputs
-from lt_lib.report import grid_corruption
-from lt_lib.runs import RunStore
+)
+from lt_lib.settings.ppo import PpoConfig
+from lt_lib.settings.profiles import explain
+from lt_lib.store.runs import RunStore
 
 GRID = Grid(load_layout("grid"))
 EXACT = {"rtol": 1e-4, "atol": 1e-6}

@@ -8,10 +8,15 @@ import warnings
 
 import pytest
 
-from lt_lib.params import ROOT, notebook_names
 from lt_lib.report.readme import FULL, README, refreshed
+from lt_lib.settings.base import ROOT
+from lt_lib.settings.profiles import notebook_names
 
-FLOORS = {"params": 0, "runs": 0, "envs": 1, "perception": 2, "comm": 2, "learners": 3, "report": 3}
+STUDIES = ("pixels", "velocity", "gridworld", "learnability", "hardware", "speed", "environments")
+SHARED = {"settings": 0, "store": 1, "envs": 2, "perception": 3, "comm": 4, "ppo": 4, "report": 5}
+FLOORS = SHARED | dict.fromkeys(STUDIES, 6)
+    STUDIES, 6
+)
 LONGEST_CELL = 36
 LONGEST_FUNCTION = 60
 LONGEST_FULL_RUN_S = 2 * 3600

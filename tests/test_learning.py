@@ -5,20 +5,22 @@ import pytest
 import torch
 import yaml
 
+from lt_lib import ppo
 from lt_lib.comm.channel import CORRUPTIONS, deliver
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.materials import PALETTE
-from lt_lib.learners import ppo
-from lt_lib.learners.episodes import Draws, draw_scenes, drive, roll_bank
-from lt_lib.learners.executor import Executor, FrozenExecutor
-from lt_lib.learners.route import train_head
-from lt_lib.params import BankConfig, HeadConfig, PpoConfig, layout_path
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.perception.jepa import GRID, colour_classes
 from lt_lib.perception.objective import Jepa, class_weights, covariance_loss, variance_loss
+from lt_lib.pixels.episodes import Draws, draw_scenes, drive, roll_bank
+from lt_lib.pixels.executor import Executor, FrozenExecutor
+from lt_lib.pixels.route import train_head
+from lt_lib.settings.base import layout_path
+from lt_lib.settings.pixels import BankConfig, HeadConfig
+from lt_lib.settings.ppo import PpoConfig
 
 LAYOUT = load_layout("default")
 EXACT = {"rtol": 1e-5, "atol": 1e-6}

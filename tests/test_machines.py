@@ -20,15 +20,17 @@ import pytest
 import torch
 from toy_project import COMPUTE, LIMIT_S, WRITE, journal, losses, smoke, write_notebook
 
-from lt_lib import cluster
-from lt_lib.devices import computing_device
 from lt_lib.envs.opengl import install_line
-from lt_lib.files import claimed, outputs_folder, require_own_checkout
-from lt_lib.learners.protocol import Protocol
-from lt_lib.params import ROOT, EncoderConfig, UserError, notebook_names
 from lt_lib.perception.jepa import train_encoder
-from lt_lib.progress import read_progress, stage
-from lt_lib.runs import Run
+from lt_lib.pixels.protocol import Protocol
+from lt_lib.settings.base import ROOT, UserError
+from lt_lib.settings.devices import computing_device
+from lt_lib.settings.perception import EncoderConfig
+from lt_lib.settings.profiles import notebook_names
+from lt_lib.store import cluster
+from lt_lib.store.files import claimed, outputs_folder, require_own_checkout
+from lt_lib.store.progress import read_progress, stage
+from lt_lib.store.run import Run
 from run_all import code_cells, ended_by_signals, make_plan, parse, preflight
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -83,11 +85,11 @@ def checkout(tmp_path):
 
 @pytest.mark.parametrize("named", [None, "egl", "osmesa"])
 def test_without_opengl_the_library_is_imported_and_drawing_is_refused_in_one_line(no_opengl, named):
-    code = """from lt_lib.learners import predictor
+    code = """from lt_lib.learnability import predictor
 from lt_lib.envs.arena import Arena
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.reference import ReferenceCamera
-from lt_lib.params import UserError
+from lt_lib.settings.base import UserError
 print(Arena(load_layout("default"), 1).n)
 try:
     ReferenceCamera(load_layout("default"))
@@ -278,10 +280,10 @@ def test_a_checkout_of_windows_has_the_same_bytes(tmp_path):
 
 
 def test_windows_line_ends_change_neither_a_run_s_key_nor_the_code_that_a_cluster_compares(checkout):
-    code = """from lt_lib.cluster import code_digest
-from lt_lib.params import EncoderConfig
+    code = """from lt_lib.store.cluster import code_digest
+from lt_lib.settings.perception import EncoderConfig
 from lt_lib.perception.jepa import train_encoder
-from lt_lib.runs import Run
+from lt_lib.store.run import Run
 print(code_digest(), Run(train_encoder, EncoderConfig(), 0).key())"""
     before = python(code, checkout)
     assert before.returncode == 0, before.stderr
@@ -375,8 +377,8 @@ def test_another_user_s_folder_is_refused_in_one_line(tmp_path):
         pass
     (tmp_path / ".claimed").chmod(0o600)
     code = f"""import os, pathlib
-from lt_lib.files import claimed
-from lt_lib.params import UserError
+from lt_lib.store.files import claimed
+from lt_lib.settings.base import UserError
 os.setuid(65534)
 try:
     with claimed(pathlib.Path({str(tmp_path)!r})):
@@ -448,8 +450,8 @@ def test_modules_that_only_unix_has_are_not_needed(tmp_path, project):
     unix = ("fcntl", "grp", "pwd", "termios", "pty")  # psutil itself wants `resource` on Linux
     code = f"""import pathlib, sys, run_all
 assert not set(sys.modules) & set({unix!r})
-import lt_lib.files, lt_lib.progress, lt_lib.runs
-with lt_lib.files.claimed(pathlib.Path({str(tmp_path)!r})):
+import lt_lib.store.files, lt_lib.store.progress, lt_lib.store.runs
+with lt_lib.store.files.claimed(pathlib.Path({str(tmp_path)!r})):
     sys.exit(run_all.main(["--list"], pathlib.Path({str(project)!r})))"""
     ended = python(code, PYTHONPATH=without(tmp_path, *unix))
     assert (ended.returncode, ended.stdout) == (0, "02_encoder\n03_gridworld\n"), ended.stderr

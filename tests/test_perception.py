@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from lt_lib.envs.layout import load_layout
-from lt_lib.files import content_digest
-from lt_lib.params import EncoderConfig, Gates, UserError
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, architecture
 from lt_lib.perception.frames import hazard_visible, random_rollouts
 from lt_lib.perception.gates import GateError, effective_rank, encode, require_gates
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import load_frozen, save_frozen
 from lt_lib.preflight import check_inputs, settled
+from lt_lib.settings.base import UserError
+from lt_lib.settings.perception import EncoderConfig, Gates
+from lt_lib.store.files import content_digest
 
 PASSED = {"hazard": 0.95, "majority": 0.8, "walls": 0.97, "rank": 50.0}
 

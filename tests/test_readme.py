@@ -12,8 +12,8 @@ import yaml
 
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import load_layout
-from lt_lib.params import ROOT
 from lt_lib.report.readme import README
+from lt_lib.settings.base import ROOT
 
 TEXT = README.read_text(encoding="utf-8")
 PYTHON = {section: re.findall(r"```python\n(.*?)```", body, re.DOTALL) for section, body in
@@ -62,9 +62,9 @@ import numpy as np
 from pathlib import Path
 from lt_lib.comm.messages import CONDITIONS, CONTENTS, Sender
 from lt_lib.envs.layout import load_layout
-from lt_lib.learners.episodes import draw_scenes
-from lt_lib.learners.route import train_head
-from lt_lib.params import HeadConfig
+from lt_lib.pixels.episodes import draw_scenes
+from lt_lib.pixels.route import train_head
+from lt_lib.settings.pixels import HeadConfig
 from lt_lib.perception.weights import load_frozen
 layout = load_layout("default")
 encoder = load_frozen(Path("outputs/full/weights"), "encoder", layout)
@@ -82,9 +82,9 @@ assert train("signs")["optimal"][-500:].mean() > 0.9
 """,
     "condition": TRAIN
     + """
-from lt_lib.params import load_profile
+from lt_lib.settings.profiles import load_profile
 from lt_lib.preflight import check_inputs
-from lt_lib.report import pixels
+from lt_lib.pixels import figures as pixels
 from lt_lib.report.claims import load_claims
 seeds = load_profile("full")["04_pixels"]["seeds"]
 assert seeds["shuffled"] == 5
@@ -99,9 +99,9 @@ pixels.routes(heads, load_claims())
     "layout": """
 import numpy as np
 from run_all import make_plan, parse, preflight
-from lt_lib.params import ROOT
+from lt_lib.settings.base import ROOT
 from lt_lib.envs.geodesic import RouteDistance
-from lt_lib.envs.gym import ArenaEnv
+from lt_lib.environments.gym import ArenaEnv
 from lt_lib.envs.layout import load_layout
 plan = make_plan(parse(["--profile", "smoke"]), ROOT)
 assert plan.parameters["04_pixels"]["layout"] == "far"

@@ -7,19 +7,22 @@ import pytest
 import torch
 import yaml
 
+from lt_lib import ppo
 from lt_lib.comm.channel import deliver
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import load_layout
-from lt_lib.learners import episodes, ppo, redraw
-from lt_lib.learners.episodes import Outcomes, draw_scenes, drive, roll_bank
-from lt_lib.learners.executor import Executor, FrozenExecutor
-from lt_lib.learners.redraw import CREDITS, REDRAWS, Decisions, LiveArena, draws_an_episode, train_redrawn_head
-from lt_lib.learners.route import train_head
-from lt_lib.params import BankConfig, HeadConfig, PpoConfig, RedrawConfig, layout_path
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
-from lt_lib.report.redraw import fall_test
+from lt_lib.pixels import episodes, redraw
+from lt_lib.pixels.episodes import Outcomes, draw_scenes, drive, roll_bank
+from lt_lib.pixels.executor import Executor, FrozenExecutor
+from lt_lib.pixels.redraw import CREDITS, REDRAWS, Decisions, LiveArena, draws_an_episode, train_redrawn_head
+from lt_lib.pixels.redraw_figures import fall_test
+from lt_lib.pixels.route import train_head
+from lt_lib.settings.base import layout_path
+from lt_lib.settings.pixels import BankConfig, HeadConfig, RedrawConfig
+from lt_lib.settings.ppo import PpoConfig
 
 ROWS = redraw.BLOCK  # the batches of `drive` and the blocks of the live code then have one size
 SHORT = 45  # control steps, in place of 600

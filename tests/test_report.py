@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from lt_lib.params import ROOT, UserError
 from lt_lib.report import forest, scoreboard, stats
 from lt_lib.report.claims import Claim, Finding, Findings, load_claims, verdict
+from lt_lib.settings.base import ROOT, UserError
 
 EXACT = 1e-12  # closed forms and loops against floating point
 PRINTED = 5e-5  # four printed decimals

@@ -12,10 +12,11 @@ from pydantic import TypeAdapter, ValidationError
 from toy_project import COMPUTE, LIMIT_S, RAISE, WRITE, journal, losses, smoke, start, wait_until, write_notebook
 from toy_runs import ToyConfig, train_toy
 
-from lt_lib import params
-from lt_lib.manifest import stages_since
-from lt_lib.params import UserError, explain, load_profile
-from lt_lib.progress import Progress
+from lt_lib.settings import profiles
+from lt_lib.settings.base import Settings, UserError
+from lt_lib.settings.profiles import explain, load_profile
+from lt_lib.store.manifest import stages_since
+from lt_lib.store.progress import Progress
 from run_all import choose, clock, describe, main
 
 # --- bad input
@@ -131,13 +132,13 @@ def test_a_profile_gives_shared_values_where_declared_and_the_notebooks_own_over
 
 
 def test_a_dict_without_settings_is_refused(project, monkeypatch):
-    monkeypatch.delitem(params.SECTIONS, "toy")
+    monkeypatch.delitem(profiles.SECTIONS, "toy")
     with pytest.raises(UserError, match="02_encoder: toy: SECTIONS has no settings for it"):
         load_profile("smoke", project)
 
 
 def test_settings_are_strict_frozen_and_take_lists_for_tuples():
-    class Nested(params.Settings):
+    class Nested(Settings):
         corners: tuple[tuple[float, float], ...] = ()
 
     config = Nested(corners=[[0, 1], [2, 3.5]])
@@ -157,7 +158,7 @@ def test_the_error_of_a_deep_setting_names_its_place():
 
 
 def test_an_unknown_setting_in_a_dict_or_list_of_settings_is_named_with_those_there_are():
-    class Shelf(params.Settings):
+    class Shelf(Settings):
         toys: dict[str, ToyConfig]
         row: tuple[ToyConfig, ...] = ()
 

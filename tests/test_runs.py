@@ -15,10 +15,11 @@ import pytest
 from pydantic import computed_field
 from toy_runs import ToyConfig, count_threads, lose_worker, train_toy
 
-from lt_lib.params import UserError
-from lt_lib.progress import Reporter, read_progress, stage, write_fraction
-from lt_lib.runs import Run, RunError, RunStore, pack, unpack
-from lt_lib.sources import source_digest
+from lt_lib.settings.base import UserError
+from lt_lib.store.progress import Reporter, read_progress, stage, write_fraction
+from lt_lib.store.run import Run, pack, unpack
+from lt_lib.store.runs import RunError, RunStore
+from lt_lib.store.sources import source_digest
 
 SLOW = ToyConfig(seconds=0.3)
 
@@ -110,7 +111,7 @@ def test_key_follows_what_settings_compute_and_its_name_in_errors_does_not(tmp_p
 @pytest.mark.parametrize("library", ["torch", "numpy", "mujoco"])
 def test_key_follows_library_versions(library, monkeypatch):
     before = toys(1)[0].key()
-    monkeypatch.setattr("lt_lib.runs.library_versions", lambda: {library: "0.1"})
+    monkeypatch.setattr("lt_lib.store.run.library_versions", lambda: {library: "0.1"})
     assert toys(1)[0].key() != before
 
 
@@ -126,13 +127,15 @@ def test_a_function_that_workers_cannot_import_is_refused():
 LAB = {
     "lab/__init__.py": "",
     "lab/train.py": '"""Doc."""\n'
-    "from lab.deep import layer\nfrom lt_lib.params import TrainConfig\ndef train(): pass\n",
+    "from lab.deep import layer\nfrom lt_lib.settings.lab import TrainConfig\ndef train(): pass\n",
     "lab/deep/__init__.py": "WIDTH = 3\n",
     "lab/deep/layer.py": "def layer():\n    from .. import lazy\n    return 1\n",
     "lab/lazy.py": "import numpy\n",
     "lab/unrelated.py": "from lab import train\n",
     "lt_lib/__init__.py": "",
-    "lt_lib/params.py": "class Base: pass\nclass TrainConfig(Base): size = 1\nclass OtherConfig(Base): size = 1\n",
+    "lt_lib/settings/lab.py": "from lt_lib.settings.base import Base\nclass TrainConfig(Base): size = 1\n",
+    "lt_lib/settings/base.py": "class Base: pass\n",
+    "lt_lib/settings/other.py": "class OtherConfig(Base): size = 1\n",
 }
 
 
@@ -161,8 +164,8 @@ def lab_digest(tmp_path):
         ("lab/deep/__init__.py", "3", "4"),
         ("lab/deep/layer.py", "return 1", "return 2"),
         ("lab/lazy.py", "numpy", "scipy"),
-        ("lt_lib/params.py", "TrainConfig(Base): size = 1", "TrainConfig(Base): size = 2"),
-        ("lt_lib/params.py", "Base: pass", "Base: size = 2"),
+        ("lt_lib/settings/lab.py", "size = 1", "size = 2"),
+        ("lt_lib/settings/base.py", "Base: pass", "Base: size = 2"),
     ],
 )
 def test_digest_changes_with_code_that_is_imported(lab_digest, file, old, new):
@@ -175,7 +178,7 @@ def test_digest_changes_with_code_that_is_imported(lab_digest, file, old, new):
         ("lab/unrelated.py", "train", "deep"),
         ("lab/train.py", "Doc.", "Another docstring."),
         ("lab/train.py", "def train(): pass", "# why\ndef train():\n    'What it does.'\n    pass"),
-        ("lt_lib/params.py", "OtherConfig(Base): size = 1", "OtherConfig(Base): size = 2"),
+        ("lt_lib/settings/other.py", "size = 1", "size = 2"),
     ],
 )
 def test_digest_stays_with_unrelated_code_comments_and_docstrings(lab_digest, file, old, new):

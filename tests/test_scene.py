@@ -17,11 +17,11 @@ from lt_lib.envs.materials import HAZARD, INDEX
 from lt_lib.envs.occlusion import occlusion, require_occlusion, sight_map
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.envs.warp_camera import WarpCamera
-from lt_lib.learners.episodes import draw_scenes, drive
-from lt_lib.learners.executor import FrozenExecutor
-from lt_lib.params import UserError, layout_path
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import free_poses
+from lt_lib.pixels.episodes import draw_scenes, drive
+from lt_lib.pixels.executor import FrozenExecutor
+from lt_lib.settings.base import UserError, layout_path
 
 DEFAULT = yaml.safe_load(layout_path("default").read_text())
 SUBSTEPS = 6  # of physics a control step: 60 Hz over 10 Hz

@@ -12,8 +12,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from lt_lib.params import ROOT, notebook_names
 from lt_lib.report.claims import load_claims
+from lt_lib.settings.base import ROOT
+from lt_lib.settings.profiles import notebook_names
 
 COMMAND = [sys.executable, "run_all.py", "--profile", "smoke"]
 LIMIT_S = 1200  # a slow machine with other work

@@ -6,14 +6,13 @@ import torch
 from scipy.special import expit
 from scipy.stats import kstest, norm
 
-from lt_lib.envs import point_mass
 from lt_lib.envs.layout import load_layout
-from lt_lib.envs.windows import STREAMS, WORDS, normals
-from lt_lib.learners import predictor
-from lt_lib.learners.score_function import ARMS, BASELINES, Episodes, Stack, gradient, play, train_point_mass
-from lt_lib.params import BLOCK, PointMassConfig, UserError
-from lt_lib.report import sigmoid, zstudy
+from lt_lib.learnability import figures as zstudy, point_mass, predictor, sigmoid
+from lt_lib.learnability.score_function import ARMS, BASELINES, Episodes, Stack, gradient, play, train_point_mass
+from lt_lib.learnability.windows import STREAMS, WORDS, normals
 from lt_lib.report.claims import load_claims
+from lt_lib.settings.base import UserError
+from lt_lib.settings.learnability import BLOCK, PointMassConfig
 
 SMALL = PointMassConfig(
     window=7, distances=(0.2, 0.6), sigmas=(0.5, 1.0), seeds=2, batch=16, budgets=(BLOCK, 2 * BLOCK), evaluation=64

@@ -24,8 +24,9 @@ toy = {}"""
 COMPUTE = """import json
 from pathlib import Path
 from toy_runs import ToyConfig, train_toy
-from lt_lib.files import runs_folder
-from lt_lib.runs import Run, RunStore
+from lt_lib.store.files import runs_folder
+from lt_lib.store.run import Run
+from lt_lib.store.runs import RunStore
 store = RunStore(runs_folder(Path(".")), workers)
 results = store.fetch([Run(train_toy, ToyConfig(**toy), seed) for seed in range(count)], "toys")"""
 

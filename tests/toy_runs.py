@@ -7,7 +7,7 @@ from importlib import import_module
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveInt
 
-from lt_lib.params import Settings
+from lt_lib.settings.base import Settings
 
 
 class ToyConfig(Settings):

@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from lt_lib.envs.layout import SIDES, Layout
-from lt_lib.params import UserError
+from lt_lib.settings.base import UserError
 
 RESOLUTION = 0.05  # metres
 MARGIN = 0.02  # metres kept from every wall

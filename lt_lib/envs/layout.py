@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
-from lt_lib.params import Settings, UserError, layout_path
+from lt_lib.settings.base import Settings, UserError, layout_path
 
 LEFT, RIGHT = 0, 1
 SIDES = ("left", "right")

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lt_lib.envs.camera import FastCamera
-from lt_lib.envs.gridworld import PATCH, Grid
 from lt_lib.envs.layout import SIDES, Layout, Pose
 from lt_lib.envs.materials import HAZARD
-from lt_lib.params import UserError
+from lt_lib.settings.base import UserError
 
 PIXELS = 512  # the paper's occlusion frame is 512 x 512
 SLAB = np.flatnonzero(HAZARD).astype(np.uint8)  # the slab's palette indices, which are consecutive
@@ -83,15 +82,3 @@ def sight_map(layout: Layout, slab: int, spacing: float = 0.1, pixels: int = 256
         others = np.tile(layout.scout.array[:2], (len(eyes), 1))
         most[i, j] = hazard_pixels(camera, eyes, np.full(len(eyes), slab), others).max()
     return SightMap(x, y, most)
-
-
-def require_occluded_choices(grid: Grid) -> None:
-    """Raises UserError unless every choice cell looks the same, cell for cell, under either placement of the slab."""
-    for point in grid.layout.choice_points:
-        cell = grid.at(point.x, point.y)
-        if grid.revealing[cell]:
-            differ = int((grid.patches[cell, 0] != grid.patches[cell, 1]).sum())
-            raise UserError(
-                f"layout {grid.layout.name}: from the choice cell at ({point.x}, {point.y}) m the placements of the "
-                f"slab differ in {differ} of {PATCH**2} cells; move the slab or its corridor's bend out of sight"
-            )

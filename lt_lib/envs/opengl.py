@@ -16,7 +16,7 @@ from unittest import mock
 import mujoco
 from mujoco.rendering.classic import gl_context
 
-from lt_lib.params import ROOT, UserError
+from lt_lib.settings.base import ROOT, UserError
 
 # What MuJoCo knows on every system, and what Linux has to be installed for each
 NAMES = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw"), "Windows": ("wgl", "glfw")}

@@ -5,7 +5,7 @@ Kept apart from the annotated functions that call it, since compiled code must n
 
 import numpy as np
 
-from lt_lib.compiled import compiled
+from lt_lib.envs.compiled import compiled
 from lt_lib.envs.materials import INDEX
 
 _SKY, _FLOOR, _GOAL, _ROBOT = (np.uint8(INDEX[name]) for name in ("sky", "floor", "goal", "robot"))

@@ -15,9 +15,10 @@ from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.manifold import TSNE
 
 from lt_lib.envs.layout import load_layout
-from lt_lib.params import GateConfig, Gates, UserError
 from lt_lib.perception.encoder import LATENT, FrozenEncoder, in_chunks
 from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixels
+from lt_lib.settings.base import UserError
+from lt_lib.settings.perception import GateConfig, Gates
 
 PROBE_SHARE = 0.7  # of the held-out rollouts train the probes, the rest test them
 

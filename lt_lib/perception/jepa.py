@@ -13,10 +13,10 @@ from torch import Tensor
 from lt_lib.envs.camera import network_input
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.materials import PALETTE
-from lt_lib.params import EncoderConfig
 from lt_lib.perception.encoder import Encoder, in_chunks
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
+from lt_lib.settings.perception import EncoderConfig
 
 LEVELS = 4  # quantised levels a colour channel
 GRID = 16  # cells a side of the reconstructed frame

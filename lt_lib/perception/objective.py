@@ -18,8 +18,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lt_lib.params import EncoderConfig
 from lt_lib.perception.encoder import LATENT, Predictor
+from lt_lib.settings.perception import EncoderConfig
 
 
 class Losses(NamedTuple):

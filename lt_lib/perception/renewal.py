@@ -3,7 +3,7 @@
 Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
 """
 
-from lt_lib.compiled import compiled
+from lt_lib.envs.compiled import compiled
 
 
 @compiled()

@@ -9,8 +9,8 @@ import numpy as np
 import safetensors.numpy
 
 from lt_lib.envs.layout import Layout
-from lt_lib.files import content_digest, write_atomically
-from lt_lib.params import UserError
+from lt_lib.settings.base import UserError
+from lt_lib.store.files import content_digest, write_atomically
 
 FORMAT = 1
 

@@ -18,8 +18,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from lt_lib.files import content_digest, writable_folder, write_atomically
-from lt_lib.params import ROOT, Settings, UserError, explain, read_yaml, require_known
+from lt_lib.settings.base import ROOT, Settings, UserError, read_yaml, require_known
+from lt_lib.settings.profiles import explain
+from lt_lib.store.files import content_digest, writable_folder, write_atomically
 
 Notebook = Literal[
     "01_occlusion_check", "02_encoder", "03_gridworld", "04_pixels", "05_coverage_sweep",

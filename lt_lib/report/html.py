@@ -18,9 +18,9 @@ from nbconvert import HTMLExporter
 from nbconvert.filters import markdown2html
 from traitlets.config import Config
 
-from lt_lib.files import writable_folder, write_atomically
-from lt_lib.params import ROOT, UserError
 from lt_lib.report.scoreboard import MARKS, told
+from lt_lib.settings.base import ROOT, UserError
+from lt_lib.store.files import writable_folder, write_atomically
 
 # What nbconvert would load from the network goes: no notebook here has widgets, diagrams or LaTeX.
 PAGE = """

@@ -12,7 +12,7 @@ from lt_lib.envs.camera import colours
 from lt_lib.perception.frames import hazard_visible
 from lt_lib.perception.jepa import GRID, colour_classes
 from lt_lib.report.style import ROLES
-from lt_lib.runs import Result
+from lt_lib.store.run import Result
 
 
 def training_frames(frames: UInt8[np.ndarray, "n h w"]) -> Figure:

@@ -4,9 +4,9 @@ import json
 import re
 from pathlib import Path
 
-from lt_lib.params import ROOT
 from lt_lib.report.claims import load_claims
 from lt_lib.report.scoreboard import headline, join, read_findings, summary
+from lt_lib.settings.base import ROOT
 
 README = ROOT / "README.md"
 FULL = ROOT / "outputs" / "full"

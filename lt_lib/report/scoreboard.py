@@ -9,8 +9,6 @@ import pandas as pd
 from pandas.io.formats.style import Styler
 from pydantic import ValidationError
 
-from lt_lib.files import content_digest, writable_folder, write_atomically
-from lt_lib.params import Settings, UserError, explain
 from lt_lib.report.claims import (
     JUDGED,
     NO_VERDICT,
@@ -24,6 +22,9 @@ from lt_lib.report.claims import (
     Findings,
     verdict,
 )
+from lt_lib.settings.base import Settings, UserError
+from lt_lib.settings.profiles import explain
+from lt_lib.store.files import content_digest, writable_folder, write_atomically
 
 DISCUSSED = "discussed in"  # the notebook that says what was tried, and what the likeliest cause is
 COLUMNS = ["id", "notebook", "what", "kind", "paper", "ours", "low", "high", "n", "test", "p", "verdict"]

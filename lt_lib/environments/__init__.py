@@ -1,0 +1,1 @@
+"""The task for other people's learners: Gymnasium and PettingZoo."""

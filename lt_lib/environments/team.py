@@ -1,0 +1,92 @@
+"""The two-robot team as a PettingZoo environment: a navigator that chooses, a scout that sees, a channel between them.
+
+The scout's action is its message, of any content; the channel is the paper's (Section Broadcast and anchor), so that
+what it sends at one step reaches the navigator at the next, with the anchor of that step. Learners may train either
+robot or both: a frozen encoder as the scout's policy is the paper's own condition.
+"""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Dict
+from jaxtyping import Float, UInt8
+from pettingzoo import ParallelEnv
+
+from lt_lib.comm.channel import ANCHOR, deliver
+from lt_lib.comm.messages import CONTENT
+from lt_lib.environments.gym import Scenes, frame_space, velocity_space
+from lt_lib.envs.arena import CONTROL_HZ
+from lt_lib.envs.layout import load_layout
+from lt_lib.envs.reference import TopView
+
+NAVIGATOR, SCOUT = "navigator", "scout"
+
+
+class TeamEnv(ParallelEnv):
+    """Both robots get the team's reward, and end together: on the navigator's arrival, or after 600 steps.
+
+    navigator  observes {"frame": own frame (64, 64, 3) uint8, "wire": (2 + content,) float32, zeros before the first
+               message arrives}; acts by a body-frame velocity in [-1, 1]^3
+    scout      observes its own frame (64, 64, 3) uint8; acts by a message (content,) float32; it stands still
+
+    Raises UserError for an unknown layout, and for `render_mode="rgb_array"` where there is no OpenGL.
+    """
+
+    metadata: ClassVar = {"name": "latent_telepathy_v0", "render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
+
+    def __init__(self, layout: str = "default", content: int = CONTENT, render_mode: str | None = None):
+        self._scenes, self._rng = Scenes(load_layout(layout), 1), np.random.default_rng()
+        scene = self._scenes.arena.layout
+        self.possible_agents, self.agents = [NAVIGATOR, SCOUT], []
+        wire = Box(-np.inf, np.inf, (ANCHOR + content,), np.float32)
+        self.observation_spaces = {
+            NAVIGATOR: Dict({"frame": frame_space(scene), "wire": wire}),
+            SCOUT: frame_space(scene),
+        }
+        self.action_spaces = {NAVIGATOR: velocity_space(), SCOUT: Box(-np.inf, np.inf, (content,), np.float32)}
+        self._wire = np.zeros(wire.shape, np.float32)
+        self.render_mode = render_mode
+        self._view = TopView(scene) if render_mode else None
+
+    def observation_space(self, agent: str):
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str):
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None):
+        """A new episode; `seed` starts the random numbers of this and all later ones. There are no options."""
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        self._scenes.restart(np.ones(1, bool), [self._rng])
+        self.agents = list(self.possible_agents)
+        self._wire = np.zeros_like(self._wire)
+        return self._observe(), self._each(self._scenes.info())
+
+    def step(self, actions: dict[str, np.ndarray]):
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        reward, terminated, truncated = self._scenes.step(actions[NAVIGATOR][None])
+        self._wire = self._delivered(np.asarray(actions[SCOUT], np.float32))
+        told = self._observe(), *map(self._each, (reward.item(), terminated.item(), truncated.item()))
+        infos = self._each(self._scenes.info())
+        if terminated or truncated:
+            self.agents = []
+        return *told, infos
+
+    def render(self) -> UInt8[np.ndarray, "h w 3"] | None:
+        return self._scenes.seen_by(self._view) if self._view else None
+
+    def _delivered(self, message: Float[np.ndarray, " c"]) -> Float[np.ndarray, " w"]:
+        """The wire after this step: the message sent before it, the anchor after it."""
+        arena = self._scenes.arena
+        sent, radius = torch.from_numpy(message)[None], arena.layout.communication_radius
+        return deliver(sent, arena.scout[:, :2], arena.pose[:, :2], radius)[0].numpy()
+
+    def _observe(self) -> dict[str, Any]:
+        navigator = {"frame": self._scenes.navigator_frames()[0], "wire": self._wire}
+        return {NAVIGATOR: navigator, SCOUT: self._scenes.scout_frames()[0]}
+
+    def _each(self, value: Any) -> dict[str, Any]:
+        return dict.fromkeys(self.possible_agents, value)

@@ -1,0 +1,1 @@
+"""The gridworld (Sections Setup, Gridworld): map, patch encoder, receiver trained by MAPPO, corruption."""

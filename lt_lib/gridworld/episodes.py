@@ -1,0 +1,102 @@
+"""Episodes of a frozen gridworld policy, with whatever happens to the wire (Section Corruption controls)."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lt_lib.comm.channel import CORRUPTIONS
+from lt_lib.envs.layout import load_layout
+from lt_lib.gridworld.map import HORIZON, Grid
+from lt_lib.gridworld.mappo import Actor, Inputs
+from lt_lib.gridworld.patches import FrozenPatchEncoder
+from lt_lib.gridworld.walks import States, first_states
+from lt_lib.settings.gridworld import GridEvaluationConfig
+
+Choice = Callable[[Float[Tensor, "n 5"], np.random.Generator], Int[np.ndarray, " n"]]
+
+
+def greedy(logits: Float[Tensor, "n 5"], rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+    """The likeliest action."""
+    return logits.argmax(1).numpy()
+
+
+def sampled(logits: Float[Tensor, "n 5"], rng: np.random.Generator) -> Int[np.ndarray, " n"]:
+    """An action drawn from the policy, as in training."""
+    cumulative = logits.softmax(1).cumsum(1).numpy()
+    return (rng.random((len(logits), 1)) >= cumulative[:, :-1]).sum(1)
+
+
+CHOICES = {f.__name__: f for f in (greedy, sampled)}
+
+
+def evaluate_grid(
+    config: GridEvaluationConfig,
+    seed: int,
+    *,
+    report: Callable[[float], None],
+    policy: Mapping[str, np.ndarray],
+    encoder: Mapping[str, np.ndarray],
+) -> dict:
+    """Plays a frozen policy under one wire condition, its actions greedy and, on the same starts, sampled.
+
+    For each, named "greedy.*" and "sampled.*": "success", "length", "rerouted" (n,) and "cells" (n, 101) of the
+    navigator, padded with the last; "slab" (n,) is the blocked corridor.
+    """
+    grid = Grid(load_layout(config.layout))
+    inputs = Inputs.of(grid, FrozenPatchEncoder(encoder), config.content)
+    actor, result = read_actor(policy), {}
+    for name, choose in CHOICES.items():
+        rng = np.random.default_rng([seed, 9])
+        starts = first_states(grid, config.episodes, rng)
+        cells = play(grid, inputs, actor, starts, config.wire, choose, rng)
+        arrived = grid.goal[cells]
+        ended = arrived | grid.slab[starts.slab[:, None], cells]
+        length = np.where(ended.any(1), ended.argmax(1), HORIZON)
+        result |= {
+            f"{name}.success": arrived[:, -1],
+            f"{name}.length": length,
+            f"{name}.rerouted": rerouted(grid, cells),
+            f"{name}.cells": cells.astype(np.int16),
+        }
+    return result | {"slab": starts.slab}
+
+
+@torch.no_grad()
+def play(
+    grid: Grid, inputs: Inputs, actor: Actor, starts: States, wire: str, choose: Choice, rng: np.random.Generator
+) -> Int[np.ndarray, "n t"]:
+    """The navigator's cells, (n, 101); it stays where its episode ended.
+
+    What is corrupted is corrupted alike throughout an episode, as the true message of a stationary scout is: one donor,
+    one draw of the noise.
+    """
+    cell, slab = starts.cell, torch.from_numpy(starts.slab)
+    seed, cells = int(rng.integers(2**32)), [starts.cell]
+    for step in range(HORIZON):
+        message = torch.zeros_like(slab) if step == 0 else torch.from_numpy(starts.post + 1)
+        where = torch.from_numpy(cell)
+        arrived = CORRUPTIONS[wire](inputs.wires(torch.stack([message, where, slab], 1)), np.random.default_rng(seed))
+        present = inputs.present[message, where]
+        wires = arrived * present[:, None]  # nothing can be corrupted before anything has arrived
+        action = choose(actor(inputs.own[where, slab], wires[:, None], present[:, None]), rng)
+        ended = grid.goal[cell] | grid.slab[starts.slab, cell]
+        cell = np.where(ended, cell, grid.following[cell, action])
+        cells.append(cell)
+    return np.stack(cells, axis=1)
+
+
+def rerouted(grid: Grid, cells: Int[np.ndarray, "n t"]) -> Bool[np.ndarray, " n"]:
+    """Whether an episode entered one corridor and then, before it ended, the other."""
+    inside = [corridor.contains(*grid.centres.T)[cells] for corridor in grid.layout.routes]
+    return np.logical_and(*(side.any(1) for side in inside))
+
+
+def read_actor(policy: Mapping[str, np.ndarray]) -> Actor:
+    """The trained actor in a result of `train_grid`."""
+    weights = {k.removeprefix("actor."): torch.tensor(v) for k, v in policy.items() if k.startswith("actor.")}
+    actor = Actor(weights["receiver.value.weight"].shape[1])
+    actor.load_state_dict(weights)
+    return actor.requires_grad_(False)

@@ -1,0 +1,1 @@
+"""Hardware decode (Section Hardware): matched optics, the surrogate camera, sessions, the probe."""

@@ -1,0 +1,1 @@
+"""A scalar predictor of learnability (Section 'A scalar predictor'): the point-mass study and its sigmoid."""

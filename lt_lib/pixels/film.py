@@ -1,0 +1,116 @@
+"""GIFs of one episode: the arena from above, the navigator's camera and the scout's, side by side."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import imageio.v3 as iio
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from lt_lib.envs.arena import CONTROL_HZ, HORIZON, Arena
+from lt_lib.envs.camera import FastCamera, colours
+from lt_lib.envs.layout import SIDES, Layout
+from lt_lib.envs.reference import TopView
+from lt_lib.perception.encoder import FrozenEncoder
+from lt_lib.pixels.episodes import Draws
+from lt_lib.pixels.executor import FrozenExecutor
+from lt_lib.pixels.route import read_head, sent_wires
+from lt_lib.store.run import Result
+
+BAND = 22  # pixels of caption above the pictures
+
+
+class Take(NamedTuple):
+    """One recorded episode: poses (T, 3) of the navigator, the scout's (3,), slab and route (0 left, 1 right)."""
+
+    poses: Float[np.ndarray, "t 3"]
+    scout: Float[np.ndarray, "3"]
+    slab: int
+    route: int
+
+
+def record(
+    layout: Layout,
+    encoder: FrozenEncoder,
+    executor: FrozenExecutor,
+    draws: Draws,
+    entry: int,
+    slab: int,
+    route: int,
+    commit_step: int,
+) -> Take:
+    """Drives one draw of the scene to the goal or the time-out, keeping the navigator's poses."""
+    arena, camera, scout = Arena(layout, 1), FastCamera(layout), draws.scout[entry : entry + 1]
+    arena.reset(np.ones(1, bool), draws.spawn[entry : entry + 1], np.array([slab]), scout)
+    poses = [arena.pose[0]]
+    while not arena.reached[0] and len(poses) <= HORIZON:
+        latent = encoder.latent(camera.frames(arena.pose, arena.slab, scout[:, :2]))
+        waiting = len(poses) <= commit_step
+        arena.step(np.zeros((1, 3)) if waiting else executor.mean_action(latent, np.array([route])))
+        poses.append(arena.pose[0])
+    return Take(np.stack(poses), scout[0], slab, route)
+
+
+def pictures(layout: Layout, take: Take, every: int, title: str, height: int = 200) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Every so many control steps, one captioned picture."""
+    top, eye = TopView(layout, 2 * height), FastCamera(layout, height)
+    slab, frames = np.array([take.slab]), []
+    for step in range(0, len(take.poses), every):
+        pose = take.poses[step]
+        above = Image.fromarray(top.picture(pose, take.slab, take.scout))
+        above = np.asarray(above.resize((above.width * height // above.height, height)))
+        seen = colours(eye.frames(pose[None], slab, take.scout[None, :2]))[0]
+        sent = colours(eye.frames(take.scout[None], slab, pose[None, :2]))[0]
+        gap = np.full((height, 6, 3), 255, np.uint8)
+        words = f"{title}: slab {SIDES[take.slab]}, head chose {SIDES[take.route]}; {step / CONTROL_HZ:.0f} s"
+        frames.append(_captioned(np.concatenate([above, gap, seen, gap, sent], axis=1), words, above.shape[1]))
+    return frames
+
+
+def _captioned(picture, words: str, left: int) -> UInt8[np.ndarray, "h w 3"]:
+    canvas = Image.new("RGB", (picture.shape[1], picture.shape[0] + BAND), "white")
+    canvas.paste(Image.fromarray(picture), (0, BAND))
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(13)
+    for x, text in (
+        (4, words),
+        (left + 10, "navigator sees"),
+        (left + picture.shape[0] + 16, "scout sees, and sends"),
+    ):
+        draw.text((x, 3), text, fill="black", font=font)
+    return np.asarray(canvas)
+
+
+def save_gif(path: Path, frames: Sequence[UInt8[np.ndarray, "h w 3"]], seconds_a_frame: float = 0.08) -> Path:
+    """Writes a looping GIF of 32 colours."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    small = [np.asarray(Image.fromarray(f).quantize(32, dither=Image.Dither.NONE).convert("RGB")) for f in frames]
+    iio.imwrite(path, small, duration=int(1000 * seconds_a_frame), loop=0)
+    return path
+
+
+def film_pair(
+    layout: Layout,
+    heads: Mapping[str, Sequence[Result]],
+    bank: Result,
+    encoder: Result,
+    executor: Result,
+    commit_step: int,
+    folder: Path,
+) -> list[Path]:
+    """Films the first held-out draw once with the first latent head and once with the first floor head, choices greedy.
+
+    The slab stands in the corridor that the floor's head prefers, so that the pair shows what the message is good for.
+    """
+    draws = Draws(bank["spawn"][:1], bank["scout"][:1])
+    frozen, driver = FrozenEncoder(encoder), FrozenExecutor(executor)
+    wires = {name: sent_wires(layout, frozen, name, *draws)[0] for name in ("floor", "latent")}  # (slab, W)
+    slab = int(read_head(heads["floor"][0]).policy(wires["floor"]).probs[0].argmax())
+    paths = []
+    for name, wire in wires.items():
+        route = int(read_head(heads[name][0]).policy(wire).probs[slab].argmax())
+        take = record(layout, frozen, driver, draws, 0, slab, route, commit_step)
+        every = max(1, len(take.poses) // 40)
+        paths.append(save_gif(folder / "figures" / f"04_{name}.gif", pictures(layout, take, every, f"message: {name}")))
+    return paths

@@ -1,0 +1,191 @@
+"""The content-controlled protocol, stage by stage (Sections Overview, Setup): what the notebooks ask the run store for.
+
+Everything but the message is held fixed: one frozen encoder, one frozen executor, one bank of episodes, one head.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lt_lib.comm.channel import CORRUPTIONS
+from lt_lib.comm.messages import CONDITIONS
+from lt_lib.envs.layout import load_layout
+from lt_lib.perception.gates import Measured, measure_gates, require_gates
+from lt_lib.perception.jepa import train_encoder
+from lt_lib.perception.weights import facts_of, load_frozen, save_frozen
+from lt_lib.pixels.episodes import ROUTES, roll_bank
+from lt_lib.pixels.executor import train_executor
+from lt_lib.pixels.redraw import REDRAWS, train_redrawn_head
+from lt_lib.pixels.route import evaluate_head, train_head
+from lt_lib.settings.base import ROOT, Training, require_known
+from lt_lib.settings.devices import computing_device
+from lt_lib.settings.perception import EncoderConfig, GateConfig, Gates
+from lt_lib.settings.pixels import BankConfig, EvaluationConfig, ExecutorConfig, HeadConfig, RedrawConfig
+from lt_lib.settings.profiles import SECTIONS
+from lt_lib.store.files import runs_folder
+from lt_lib.store.run import Result, Run
+from lt_lib.store.runs import RunStore
+
+SEED = 0  # of the one encoder and the one executor, as in the paper; heads have seeds of their own
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The stages at one size.
+
+    weights  a folder of frozen encoder and executor to use, or None: train them
+    shards   how many runs the episode bank is split into
+    """
+
+    store: RunStore
+    encoder: EncoderConfig = EncoderConfig()
+    probe: GateConfig = GateConfig()
+    gates: Gates = Gates()
+    executor: ExecutorConfig = ExecutorConfig()
+    bank: BankConfig = BankConfig()
+    head: HeadConfig = HeadConfig()
+    redraw: RedrawConfig = RedrawConfig()
+    shards: int = 8
+    weights: Path | None = None
+
+    @classmethod
+    def of(
+        cls, layout: str, device: str, workers: int | str, weights: str = "", shards: int = 8, **sections: Mapping
+    ) -> "Protocol":
+        """From a notebook's parameters: `sections` are the dicts named as in `settings.profiles.SECTIONS`."""
+        shared = {"layout": layout, "device": computing_device(device)}
+        configs = {
+            name: SECTIONS[name](**(shared if issubclass(SECTIONS[name], Training) else {}), **values)
+            for name, values in sections.items()
+        }
+        folder = ROOT / weights if weights else None
+        return cls(RunStore(runs_folder(), workers), shards=shards, weights=folder, **configs)
+
+    def encoders(self) -> dict[str, Result]:
+        """Ours, and what it must beat at the gates: an untrained one, and one trained by prediction alone."""
+        alone = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
+        configs = {
+            "ours": self.encoder,
+            "untrained": self.encoder.model_copy(update={"epochs": 0.0}),
+            "prediction alone": self.encoder.model_copy(update=alone),
+        }
+        if self.weights:
+            del configs["ours"]
+        trained = self.store.fetch([Run(train_encoder, config, SEED) for config in configs.values()], "encoders")
+        kept = {"ours": self._kept("encoder")} if self.weights else {}
+        return kept | dict(zip(configs, trained, strict=True))
+
+    def gate_reports(self, encoders: Mapping[str, Result]) -> dict[str, Result]:
+        """Probes and rank of checkpoints; see `perception.gates.Measured`."""
+        runs = [Run(measure_gates, self.probe, SEED, {"encoder": encoder}) for encoder in encoders.values()]
+        return dict(zip(encoders, self.store.fetch(runs, "freeze gates"), strict=True))
+
+    def frozen_encoder(self) -> Result:
+        """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
+        trained = (
+            self._kept("encoder")
+            if self.weights
+            else self.store.fetch([Run(train_encoder, self.encoder, SEED)], "encoder")[0]
+        )
+        require_gates(self.gate_reports({"ours": trained})["ours"], self.gates)
+        return trained
+
+    def _kept(self, kind: str) -> Result:
+        return load_frozen(self.weights, kind, load_layout(self.encoder.layout))
+
+    def frozen_executor(self, encoder: Result) -> Result:
+        """The low-level controller, pretrained behind the frozen encoder."""
+        if self.weights:
+            return self._kept("executor")
+        return self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
+
+    def encoder_facts(self, report: Result) -> dict:
+        """What goes with the frozen encoder: the settings it was trained with and what it showed at the gates."""
+        if self.weights:
+            return facts_of(self.weights, "encoder")
+        return {"settings": self.encoder.model_dump(), "gates": {name: report[name] for name in Measured._fields}}
+
+    def save_executor(self, executor: Result, folder: Path) -> Path:
+        """Keeps the frozen executor beside the frozen encoder."""
+        facts = facts_of(self.weights, "executor") if self.weights else {"settings": self.executor.model_dump()}
+        return save_frozen(folder, "executor", executor, load_layout(self.executor.layout), facts)
+
+    def episode_bank(self, encoder: Result, executor: Result) -> Result:
+        """Every outcome of `shards` times `bank.entries` draws of the scene; arrays (entries, slab, route)."""
+        inputs = {"encoder": encoder, "executor": executor}
+        shards = self.store.fetch(
+            [Run(roll_bank, self.bank, shard, inputs) for shard in range(self.shards)], "episode bank"
+        )
+        return {name: np.concatenate([shard[name] for shard in shards]) for name in shards[0]}
+
+    def trained_heads(self, seeds: Mapping[str, int], bank: Result, encoder: Result) -> dict[str, list[Result]]:
+        """Stage 2: so many seeds of each condition of Table I, all with the same settings.
+
+        Rows of REDRAWS among the names are left to `redrawn_heads`.
+        """
+        runs = {
+            (name, seed): Run(train_head, self._head(name), seed, {"bank": bank, "encoder": encoder})
+            for name, count in seeds.items()
+            if name not in REDRAWS
+            for seed in range(count)
+        }
+        return self._by_name(runs, "route heads")
+
+    def redrawn_heads(
+        self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result
+    ) -> dict[str, list[Result]]:
+        """So many seeds of each row of REDRAWS among the names, trained live on the bank's scenes; and one seed each of
+
+        no bonus   the latent drawn at every step, without the entropy bonus that all rows share
+        float32    two batches with one draw an episode: the bank's, episode by episode
+        """
+        scenes = {name: bank[name] for name in ("spawn", "scout")}
+        inputs = {"scenes": scenes, "encoder": encoder, "executor": executor}
+        rows = {(name, seed): self._redrawn(name) for name in seeds if name in REDRAWS for seed in range(seeds[name])}
+        every, once = self._redrawn("k1"), self._redrawn("k0")
+        unrewarded = every.ppo.model_copy(update={"entropy": 0.0})
+        configs = {
+            ("no bonus", SEED): every.model_copy(update={"ppo": unrewarded}),
+            **rows,
+            ("float32", SEED): once.model_copy(update={"precision": "float32", "episodes": 2 * once.batch}),
+        }
+        runs = {key: Run(train_redrawn_head, config, key[1], inputs) for key, config in configs.items()}
+        return self._by_name(runs, "redrawn heads")
+
+    def _by_name(self, runs: Mapping[tuple[str, int], Run], what: str) -> dict[str, list[Result]]:
+        """The results of runs named (row, seed): a list of seeds a row."""
+        results: dict[str, list[Result]] = {}
+        for (name, _), result in zip(runs, self.store.fetch(list(runs.values()), what), strict=True):
+            results.setdefault(name, []).append(result)
+        return results
+
+    def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
+        """A frozen trained head under every wire condition of Table IV, greedily."""
+        inputs = {"head": _weights_only(head), "bank": bank, "encoder": encoder}
+        content = CONDITIONS[name].content
+        configs = [
+            EvaluationConfig(content=content, wire=wire, layout=self.head.layout, episodes=episodes)
+            for wire in CORRUPTIONS
+        ]
+        runs = [Run(evaluate_head, config, SEED, inputs) for config in configs]
+        return dict(zip(CORRUPTIONS, self.store.fetch(runs, f"corruption of {name}"), strict=True))
+
+    def _head(self, name: str) -> HeadConfig:
+        require_known([name], CONDITIONS, "message condition")
+        condition = CONDITIONS[name]
+        return self.head.model_copy(update={"content": condition.content, "wire": condition.wire})
+
+    def _redrawn(self, name: str) -> RedrawConfig:
+        row = REDRAWS[name]
+        return self.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
+
+
+def _weights_only(head: Result) -> Result:
+    return {name: value for name, value in head.items() if name.startswith("head.")}
+
+
+def obedience(bank: Result) -> float:
+    """Share of the bank's episodes in which the executor entered the corridor that it was told to."""
+    return float((bank["entered"] == np.arange(ROUTES)).mean())

@@ -1,0 +1,105 @@
+"""Proximal policy optimisation, the one update that every policy here shares (Section Implementation).
+
+Clip 0.2, four epochs, entropy coefficient 0.01, gamma 0.99, lambda 0.95, the same for every seed and condition.
+"""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+from lt_lib.settings.ppo import PpoConfig
+
+MAX_GRADIENT_NORM = 0.5
+VALUE_COEFFICIENT = 0.5
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """A policy that PPO can improve: an nn.Module with one method."""
+
+    def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-probability of the actions, entropy, and value, each (B,)."""
+
+    def parameters(self): ...
+
+
+class Batch(NamedTuple):
+    """What was sampled, flattened to B steps."""
+
+    observations: Shaped[Tensor, "b d"]  # floats, or the gridworld's rows of tables
+    actions: Tensor  # (B,) categorical or (B, A) continuous
+    log_probs: Float[Tensor, " b"]
+    advantages: Float[Tensor, " b"]
+    returns: Float[Tensor, " b"]
+
+
+class Statistics(NamedTuple):
+    """Means over an update's minibatches."""
+
+    policy_loss: float
+    value_loss: float
+    entropy: float
+    clipped: float  # share of ratios outside the clip
+
+
+def advantages(
+    rewards: Float[Tensor, "t n"],
+    values: Float[Tensor, "t n"],
+    following: Float[Tensor, "t n"],
+    terminated: Bool[Tensor, "t n"],
+    ended: Bool[Tensor, "t n"],
+    gamma: float,
+    lam: float,
+) -> Float[Tensor, "t n"]:
+    """Generalised advantage estimates.
+
+    following   value of the state that a step led to, before any reset: a time-out bootstraps from it
+    terminated  the episode ended there for good, so nothing follows
+    ended       terminated or timed out: no credit flows across
+    """
+    delta = rewards + gamma * following * ~terminated - values
+    out, running = torch.zeros_like(delta), torch.zeros_like(delta[0])
+    for t in reversed(range(len(delta))):
+        running = delta[t] + gamma * lam * running * ~ended[t]
+        out[t] = running
+    return out
+
+
+def update(
+    policy: Policy,
+    optimiser: torch.optim.Optimizer,
+    batch: Batch,
+    config: PpoConfig,
+    minibatch: int,
+    rng: np.random.Generator,
+) -> Statistics:
+    """`config.epochs` passes over the batch in shuffled minibatches; improves `policy` in place.
+
+    Advantages are standardised over the whole batch, so a leftover minibatch of one is harmless.
+    """
+    n = len(batch.returns)
+    advantage = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std(correction=0) + 1e-8)
+    totals = []
+    for _ in range(config.epochs):
+        order = torch.from_numpy(rng.permutation(n)).to(batch.returns.device)
+        for pick in order.split(minibatch):
+            log_prob, entropy, value = policy.evaluate(batch.observations[pick], batch.actions[pick])
+            ratio = (log_prob - batch.log_probs[pick]).exp()
+            surrogate = clipped_surrogate(ratio, advantage[pick], config.clip)
+            value_loss = (value - batch.returns[pick]).square().mean()
+            loss = -surrogate.mean() + VALUE_COEFFICIENT * value_loss - config.entropy * entropy.mean()
+            optimiser.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), MAX_GRADIENT_NORM)
+            optimiser.step()
+            outside = ((ratio - 1).abs() > config.clip).float().mean()
+            totals.append(torch.stack([-surrogate.mean(), value_loss, entropy.mean(), outside]).detach())
+    return Statistics(*torch.stack(totals).mean(0).tolist())
+
+
+def clipped_surrogate(ratio: Float[Tensor, " b"], advantage: Float[Tensor, " b"], clip: float) -> Float[Tensor, " b"]:
+    """min(ratio * A, clip(ratio, 1 - clip, 1 + clip) * A)."""
+    return torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)

@@ -1,0 +1,1 @@
+"""Validated settings: what they share, one module per study, and the profiles that run_all.py gives to notebooks."""

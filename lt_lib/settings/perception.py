@@ -1,0 +1,38 @@
+"""Settings of stage 1: the pixel encoder and its freeze gates."""
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from lt_lib.settings.base import Settings, Share, Training
+
+
+class EncoderConfig(Training):
+    """Stage 1 (Section Implementation); loss weights are ours, see ASSUMPTIONS.md."""
+
+    frames: PositiveInt = 204_800
+    rollout: Annotated[int, Field(ge=2)] = 32  # frames a rollout
+    epochs: NonNegativeFloat = 2.5
+    batch: Annotated[int, Field(ge=2)] = 256
+    lr: PositiveFloat = 1e-3
+    ema: Annotated[float, Field(ge=0, lt=1)] = 0.99
+    prediction: NonNegativeFloat = 1.0
+    variance: NonNegativeFloat = 25.0
+    covariance: NonNegativeFloat = 2.5
+    reconstruction: NonNegativeFloat = 1.0
+
+
+class GateConfig(Training):
+    """How the freeze gates are measured: held-out rollouts, and how many latents to show."""
+
+    rollouts: Annotated[int, Field(ge=10)] = 640
+    length: PositiveInt = 32
+    shown: PositiveInt = 4_000
+
+
+class Gates(Settings):
+    """The pre-registered thresholds; the defaults are the paper's measured hazard probe and ours for the rest."""
+
+    hazard: Share = 0.935
+    walls: Annotated[float, Field(le=1)] = 0.95
+    rank: NonNegativeFloat = 40.0

@@ -1,0 +1,187 @@
+"""The profiles that run_all.py gives to notebooks, every value checked."""
+
+import ast
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import yaml
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
+
+from lt_lib.settings.base import ROOT, UserError, require_known
+from lt_lib.settings.gridworld import GridworldConfig
+from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, RailsConfig, SessionsConfig
+from lt_lib.settings.learnability import Budget, PointMassConfig
+from lt_lib.settings.perception import EncoderConfig, GateConfig, Gates
+from lt_lib.settings.pixels import BankConfig, ExecutorConfig, HeadConfig, RedrawConfig
+from lt_lib.settings.speed import Stretch
+from lt_lib.settings.velocity import Configuration, NavigatorConfig, RolloutConfig
+
+
+def profile_names(root: Path = ROOT) -> list[str]:
+    """The profiles of a project: every yaml file in params/ but the paper's claims."""
+    return sorted(path.stem for path in (root / "params").glob("*.yaml") if path.stem != "claims")
+
+
+def notebook_names(root: Path = ROOT) -> list[str]:
+    """The notebooks of a project in numeric order, e.g. '04_pixels'."""
+    return sorted(path.stem for path in (root / "notebooks").glob("[0-9][0-9]_*.ipynb"))
+
+
+def notebook_defaults(path: Path) -> dict[str, Any]:
+    """The names and literal values assigned in the one cell of a notebook that is tagged 'parameters'."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    tagged = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
+    if len(tagged) != 1:
+        raise UserError(f"{path.name}: expected exactly one cell tagged 'parameters', found {len(tagged)}")
+    body = ast.parse("".join(tagged[0]["source"])).body
+    try:
+        return {node.targets[0].id: ast.literal_eval(node.value) for node in body}
+    except (AttributeError, ValueError):
+        raise UserError(f"{path.name}: its parameters cell may hold only name = literal") from None
+
+
+def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
+    """What a profile gives to each notebook: {notebook: {parameter: value}}, everything checked.
+
+    A notebook's own section goes over `shared`, whose keys reach every notebook that declares them. A value
+    replaces the notebook's default as a whole, dicts included.
+
+    Raises UserError for an unknown profile, notebook or parameter, or a value of the wrong type or range.
+    """
+    require_known([name], profile_names(root), "profile")
+    folder = root / "notebooks"
+    defaults = {book: notebook_defaults(folder / f"{book}.ipynb") for book in notebook_names(root)}
+    sections = _read_sections(root / "params" / f"{name}.yaml", defaults)
+    shared = sections.pop("shared", {})
+    profile = {}
+    for book, declared in defaults.items():
+        given = {key: value for key, value in shared.items() if key in declared} | sections.get(book, {})
+        for key, value in given.items():
+            _check_value(f"{name}.yaml: {book}", key, value, declared)
+        profile[book] = given
+    return profile
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """yaml as it is meant: a key given twice is an error, not the last one's win."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        for key, count in Counter(self.construct_object(key) for key, _ in node.value).items():
+            if count > 1:
+                raise yaml.MarkedYAMLError(problem=f"{key!r} is given twice", problem_mark=node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dict[str, Any]]:
+    """The sections of a profile's file, once every notebook and every shared parameter in it is known."""
+    try:
+        sections = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeys) or {}
+    except yaml.YAMLError as error:
+        raise UserError(f"{path.name}: not valid yaml: {' '.join(str(error).split())}") from None
+    if not isinstance(sections, dict):
+        raise UserError(f"{path.name}: expected sections such as 'shared:', got {sections!r}")
+    for section, values in sections.items():
+        if section != "shared":
+            require_known([section], defaults, "notebook", f"{path.name}: ")
+        if not isinstance(values, dict):
+            raise UserError(f"{path.name}: {section}: expected its parameters below it, got {values!r}")
+    declared = {key for names in defaults.values() for key in names}
+    for key in sections.get("shared", {}):
+        if key not in declared:
+            known = _listed(declared)
+            raise UserError(f"{path.name}: shared: no notebook declares {key!r}; there are {known}")
+    return sections
+
+
+def _check_value(where: str, key: str, value: Any, declared: Mapping[str, Any]) -> None:
+    """A parameter must be declared by its notebook, have the type of its default, and satisfy SECTIONS."""
+    if key not in declared:
+        raise UserError(f"{where}: unknown parameter {key!r}; there are {_listed(declared)}")
+    if not _same_type(value, declared[key]):
+        expected = type(declared[key]).__name__
+        raise UserError(f"{where}: {key}: expected {expected} such as {declared[key]!r}, got {value!r}")
+    if key in SECTIONS:
+        try:
+            TypeAdapter(SECTIONS[key]).validate_python(value, strict=True)
+        except ValidationError as error:
+            raise UserError(f"{where}: {explain(error, key, SECTIONS[key])}") from None
+    elif isinstance(value, dict):
+        raise UserError(f"{where}: {key}: SECTIONS has no settings for it; there are {_listed(SECTIONS)}")
+
+
+def _same_type(value: Any, default: Any) -> bool:
+    """Whether a value may stand for a default: the same type, int for float, lists item by item."""
+    if isinstance(default, list) and isinstance(value, list) and default:
+        return all(any(_same_type(item, example) for example in default) for item in value)
+    return type(value) is type(default) or (type(default) is float and type(value) is int)
+
+
+def explain(error: ValidationError, name: str, settings: Any) -> str:
+    """The first complaint of pydantic in one line, e.g. 'encoder.frames: must be greater than 0, got -1'."""
+    first = error.errors()[0]
+    place = ".".join([name, *map(str, first["loc"])])
+    if first["type"] == "extra_forbidden":
+        for part in first["loc"][:-1]:
+            settings, name = _inside(settings, part), f"{name}.{part}"
+        return f"{place}: unknown parameter; {name} has {_listed(settings.model_fields)}"
+    complaint = first["msg"].replace("Input should be", "must be")
+    return f"{place}: {complaint}, got {first['input']!r}"
+
+
+def _inside(settings: Any, part: str | int) -> Any:
+    """The type of what settings have under a name, or of the items of a list or dict of settings."""
+    if hasattr(settings, "model_fields"):
+        return settings.model_fields[part].annotation
+    return next(kind for kind in reversed(get_args(settings)) if kind is not ...)
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(sorted(names))
+
+
+# How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
+SECTIONS: dict[str, Any] = {
+    "encoder": EncoderConfig,
+    "probe": GateConfig,
+    "gates": Gates,
+    "executor": ExecutorConfig,
+    "bank": BankConfig,
+    "head": HeadConfig,
+    "redraw": RedrawConfig,
+    "gridworld": GridworldConfig,
+    "peek_seeds": dict[str, PositiveInt],
+    "ablation_seeds": PositiveInt,
+    "point_mass": PointMassConfig,
+    "windows": Annotated[list[PositiveInt], Field(min_length=2)],
+    "looks": Annotated[list[Budget], Field(min_length=1)],
+    "sgd_rates": Annotated[list[PositiveFloat], Field(min_length=2)],
+    "resamples": Annotated[int, Field(ge=2)],
+    "singles": PositiveInt,
+    "timed_updates": Budget,
+    "navigator": NavigatorConfig,
+    "rollout": RolloutConfig,
+    "oracle_seeds": PositiveInt,
+    "configurations": Annotated[list[Configuration], Field(min_length=1)],
+    "sigmas": Annotated[list[PositiveFloat], Field(min_length=1)],
+    "taus": Annotated[list[NonNegativeFloat], Field(min_length=1)],
+    "draws": PositiveInt,
+    "stretch": Stretch,
+    "seeds": dict[str, PositiveInt],
+    "shards": PositiveInt,
+    "more_seeds": PositiveInt,
+    "latent_heads": PositiveInt,
+    "episodes": PositiveInt,
+    "matched": MatchedEncoderConfig,
+    "cheap": MatchedEncoderConfig,
+    "checks": MatchedGateConfig,
+    "sessions": SessionsConfig,
+    "sweep": dict[Literal["hazard", "clear", "shots"], PositiveInt],
+    "rails": RailsConfig,
+    "encoder_seeds": Annotated[int, Field(ge=2)],
+    "simulated": Annotated[int, Field(ge=2)],
+    "effects": Annotated[list[str], Field(min_length=1)],
+    "device": Literal["auto", "cpu", "cuda"],
+}

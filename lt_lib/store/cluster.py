@@ -1,0 +1,177 @@
+"""A Dask cluster as workers: its processes compute a run only if they would compute what we would.
+
+What a run's result depends on is compared twice: for all workers before any computing, and again by the worker
+for every run, since workers may come later and files may change under them.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import distributed
+import threadpoolctl
+
+from lt_lib.settings.base import UserError
+from lt_lib.settings.devices import computing_device
+from lt_lib.store.local import ONE_THREAD
+from lt_lib.store.progress import write_fraction
+from lt_lib.store.run import Packed, Run, Submit, compute, library_versions
+
+OURS = "latent-telepathy-compendium"
+ADDRESS = re.compile(r"(tcp|tls)://(\[[0-9a-fA-F:.]+\]|[\w.-]+):\d{1,5}")
+ANSWER_S = 10  # how long a scheduler may take to answer, and to have a worker
+TOPIC = "latent-telepathy-progress"
+
+
+def require_address(address: str) -> None:
+    """Raises UserError for what is no address of a scheduler."""
+    if not ADDRESS.fullmatch(address):
+        raise UserError(f"expected a scheduler's address such as tcp://127.0.0.1:8786, got {address!r}")
+
+
+def code_digest() -> str:
+    """The start of the sha256 of the library's files, as they are on the disk of this process."""
+    folder = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        text = path.read_text(encoding="utf-8")  # whatever its line ends
+        digest.update(f"{path.relative_to(folder).as_posix()}\n{text}\0".encode())
+    return digest.hexdigest()[:12]
+
+
+LOADED = code_digest()  # a worker lives long, and goes on with the code that it began with
+
+
+def identity() -> dict[str, str]:
+    """What this process computes with, by name: our version and code, and the versions of libraries."""
+    try:
+        version = metadata.version(OURS)
+    except metadata.PackageNotFoundError:
+        version = "not installed"
+    now = code_digest()
+    edited = "" if now == LOADED else f", edited since to {now}"
+    return {OURS: f"{version} (code {LOADED}{edited})", **library_versions()}
+
+
+def require_same(expected: Mapping[str, str], found: Mapping[str, str], worker: str) -> None:
+    """Raises UserError naming both versions of what a worker has otherwise than we."""
+    for name, version in expected.items():
+        if found.get(name) != version:
+            theirs = f"{name} {found[name]}" if name in found else f"no {name}"
+            raise UserError(f"worker {worker} has {theirs}, here it is {version}; start it with this version")
+
+
+@contextlib.contextmanager
+def connected(address: str) -> Iterator[distributed.Client]:
+    """A client of a scheduler with workers, each of one thread and with our versions.
+
+    Raises UserError, one line, for a bad address, no answer, no workers, or a worker that is not fit.
+    """
+    require_address(address)
+    try:
+        with _quiet():
+            client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UserError(f"no Dask scheduler answers at {address} ({type(error).__name__}); is it running?") from None
+    with client:
+        _require_workers(client, address)
+        yield client
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Dask's log holds its tongue: what it would say of a failed connection, our one line says."""
+    logger = logging.getLogger("distributed")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def _require_workers(client: distributed.Client, address: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=ANSWER_S)
+    except TimeoutError:
+        raise UserError(
+            f"the scheduler at {address} has no workers; start some with `dask worker {address} --nthreads 1`"
+        ) from None
+    for worker, threads in client.nthreads().items():
+        if threads != 1:
+            raise UserError(f"worker {worker} has {threads} threads; start it with --nthreads 1")
+    expected = identity()
+    for worker, found in client.run(identity, on_error="return").items():
+        if isinstance(found, BaseException):
+            reason = f"{type(found).__name__}: {found}"
+            raise UserError(f"worker {worker} cannot load {OURS} ({reason}), here it is {expected[OURS]}")
+        require_same(expected, found, worker)
+
+
+@contextlib.contextmanager
+def cluster_workers(address: str, progress: Path) -> Iterator[Submit]:
+    """The workers of a cluster. A run whose worker is lost is computed by another, up to Dask's allowed failures.
+
+    Raises UserError as `connected` does.
+    """
+    with connected(address) as client:
+        ours: set[str] = set()
+
+        def tell(event: tuple[float, Mapping[str, Any]]) -> None:
+            key, fraction = event[1]["key"], event[1]["fraction"]
+            if key in ours:
+                write_fraction(progress / f"{key}.json", fraction)
+
+        def submit(key: str, run: Run) -> Future:
+            ours.add(key)
+            future = executor.submit(compute_there, run, key, expected)
+            future.add_done_callback(lambda _: ours.discard(key))
+            return future
+
+        client.subscribe_topic(TOPIC, tell)
+        expected, executor = identity(), client.get_executor(pure=False)
+        yield submit
+
+
+def compute_there(run: Run, key: str, expected: Mapping[str, str]) -> Packed:
+    """Computes one run in a worker of a cluster.
+
+    Raises UserError if the worker has other versions, code or layouts than those the key was made with, or lacks the
+    device that the key names.
+    """
+    worker = distributed.get_worker()
+    require_same(expected, identity(), worker.address)
+    if "device" in type(run.config).model_fields:
+        require_device(run.config.device, worker.address)
+    if run.key() != key:
+        raise UserError(f"worker {worker.address} has other source or another layout for {run}; bring it up to date")
+    with one_thread():
+        return compute(run, lambda fraction: worker.log_event(TOPIC, {"key": key, "fraction": fraction}))
+
+
+def require_device(device: str, worker: str) -> None:
+    """Raises UserError, naming the worker that this process is, if it lacks a device."""
+    try:
+        computing_device(device)
+    except UserError as error:
+        raise UserError(f"worker {worker}: {error}") from None
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Gives the numerical libraries of this process one thread, those that are loaded and those that will be."""
+    # A loaded numba refuses another value than it found at first.
+    unread = [name for name in ONE_THREAD if name != "NUMBA_NUM_THREADS" or "numba" not in sys.modules]
+    os.environ.update({name: ONE_THREAD[name] for name in unread})
+    for library in {"torch", "numba"} & set(sys.modules):
+        sys.modules[library].set_num_threads(1)
+    with threadpoolctl.threadpool_limits(1):
+        yield

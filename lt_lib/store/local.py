@@ -1,0 +1,58 @@
+"""Worker processes on this machine, one thread each, so that results do not depend on their number."""
+
+import contextlib
+import os
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import psutil
+from joblib.externals.loky import get_reusable_executor
+
+from lt_lib.store.progress import write_fraction
+from lt_lib.store.run import Submit, compute
+
+IDLE_S = 60  # after which a worker without a run ends
+ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    ),
+    "1",
+)
+
+
+@contextlib.contextmanager
+def local_workers(processes: int, source: str, progress: Path) -> Iterator[Submit]:
+    """Worker processes of one thread each, which end with this process, however it ends, and if the block fails.
+
+    They are kept for the next stage, since each takes seconds to start; not if they were started from another
+    `source`, because theirs must be the one that was digested.
+    """
+    pool = get_reusable_executor(
+        processes, timeout=IDLE_S, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(), source)
+    )
+    try:
+        with warnings.catch_warnings():  # loky replaces a worker that has grown or idled, and says so each time
+            warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
+            yield lambda key, run: pool.submit(compute, run, partial(write_fraction, progress / f"{key}.json"))
+    except BaseException:
+        pool.shutdown(wait=True, kill_workers=True)
+        raise
+
+
+def _end_with(parent: int, source: str) -> None:
+    """Lets this worker end soon after its parent, even after one that was killed; `source` tells it from others."""
+
+    def watch() -> None:
+        while os.getppid() == parent and psutil.pid_exists(parent):  # Windows keeps the number of a dead parent
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

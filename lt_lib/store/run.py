@@ -1,0 +1,114 @@
+"""A run: one training as a pure function, the key that names its result, and its result as bytes.
+
+A run is `function(config, seed, report=..., **inputs) -> {name: array, number, text or list}`. It is pure: it
+reads no file, keeps no state and draws its randomness from `seed`, so that its key names its result.
+"""
+
+import contextlib
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+
+from lt_lib.settings.base import Settings
+from lt_lib.store.progress import Reporter
+from lt_lib.store.sources import source_digest
+
+Result = dict[str, Any]
+
+Packed = tuple[bytes, float]  # a packed result and the seconds it took
+Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run, given with its key
+
+# What a result may change with besides our own code.
+LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn", "opencv-python-headless")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One call of a training: an importable function, its settings, its seed, and results of earlier runs."""
+
+    function: Callable[..., Result]
+    config: Settings
+    seed: int
+    inputs: Mapping[str, Result] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.function.__module__ == "__main__" or "." in self.function.__qualname__:
+            raise ValueError(f"{self.function.__qualname__} must be a module's own function for workers to import it")
+
+    def key(self) -> str:
+        """sha256 of all that the result depends on: call, contents of inputs, source, library versions."""
+        module = sys.modules[self.function.__module__]
+        folder = Path(module.__file__).resolve().parents[module.__name__.count(".")]
+        parts = {
+            "function": f"{self.function.__module__}.{self.function.__qualname__}",
+            "config": self.config.model_dump(mode="json"),
+            "seed": self.seed,
+            "inputs": {name: hashlib.sha256(pack(result)).hexdigest() for name, result in self.inputs.items()},
+            "source": source_digest(self.function, type(self.config), folder=folder),
+            "libraries": library_versions(),
+        }
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+    def __str__(self) -> str:
+        changed = self.config.model_dump(mode="json", exclude_defaults=True, exclude_computed_fields=True)
+        settings = "".join(f", {name}={value!r}" for name, value in changed.items())
+        return f"{self.function.__name__}(seed={self.seed}{settings})"
+
+
+def compute(run: Run, tell: Callable[[float], None]) -> Packed:
+    """Computes one run in a worker, which tells how far it is."""
+    started = time.perf_counter()
+    payload = pack(run.function(run.config, run.seed, report=Reporter(tell), **run.inputs))
+    return payload, time.perf_counter() - started
+
+
+def pack(result: Result) -> bytes:
+    """A result as safetensors bytes, equal for equal results; what is no array goes into the header as json.
+
+    Raises TypeError naming an entry that is neither an array of numbers nor json.
+    """
+    arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
+    values = {name: value for name, value in result.items() if name not in arrays}
+    for name, value in arrays.items():
+        if value.dtype.kind not in "biuf":
+            raise TypeError(f"result {name!r}: cannot keep an array of {value.dtype}; use numbers, or a list")
+        arrays[name] = np.asarray(value, order="C")
+    try:
+        header = json.dumps(values, sort_keys=True, default=_plain_number)
+    except TypeError as error:
+        raise TypeError(f"one of the results {sorted(values)}: {error}") from None
+    return safetensors.numpy.save(arrays, {"values": header})
+
+
+def _plain_number(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"cannot keep a {type(value).__name__}; use an array, a number, text or a list")
+
+
+def unpack(payload: bytes) -> Result:
+    """The result that was packed."""
+    length = int.from_bytes(payload[:8], "little")
+    header = json.loads(payload[8 : 8 + length])
+    return safetensors.numpy.load(payload) | json.loads(header["__metadata__"]["values"])
+
+
+@cache
+def library_versions() -> dict[str, str]:
+    """The installed versions of the libraries that a result may depend on."""
+    versions = {}
+    for name in LIBRARIES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions

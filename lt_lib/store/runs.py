@@ -1,0 +1,124 @@
+"""The run store: every training is computed once, here or on a cluster, and kept in one checked file."""
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, as_completed
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import joblib
+
+from lt_lib.store.files import writable_folder, write_atomically
+from lt_lib.store.local import local_workers
+from lt_lib.store.progress import stage
+from lt_lib.store.run import Packed, Result, Run, Submit, unpack
+from lt_lib.store.sources import source_state
+
+
+class RunError(Exception):
+    """A run's function raised: the message names the run and the error, which is its cause."""
+
+
+@dataclass(frozen=True)
+class RunStore:
+    """Finished runs in a folder, `<folder>/<function>/<key>.run`, and the workers that compute missing ones.
+
+    workers: processes at a time on this machine, 0 for one a core; or a Dask scheduler's address, such as
+    tcp://127.0.0.1:8786, for the workers of its cluster. Each has one thread, so that results do not depend on it.
+    """
+
+    folder: Path
+    workers: int | str = 0
+
+    def fetch(self, runs: Sequence[Run], what: str) -> list[Result]:
+        """The results of `runs` in their order: finished ones are read, the others computed and kept.
+
+        what: a few words for the progress line, e.g. 'route heads'.
+
+        Raises UserError if the folder cannot be written or the cluster not be used, RunError once all else is done
+        if any run failed.
+        """
+        writable_folder(self.folder)
+        keys = [run.key() for run in runs]
+        wanted = dict(zip(keys, runs, strict=True))
+        results = {key: self._read(key, run) for key, run in wanted.items()}
+        missing = {key: run for key, run in wanted.items() if results[key] is None}
+        if missing:
+            self._compute(missing, what)
+            results |= {key: self._read(key, run) for key, run in missing.items()}
+        return [results[key] for key in keys]
+
+    def _path(self, key: str, run: Run) -> Path:
+        return self.folder / run.function.__name__ / f"{key}.run"
+
+    def _read(self, key: str, run: Run) -> Result | None:
+        """A finished run's result; None if there is none, or, with a warning, if its file is damaged."""
+        path = self._path(key, run)
+        if not path.exists():
+            return None
+        head, _, payload = path.read_bytes().partition(b"\n")
+        if head != _checksum(payload):
+            logging.getLogger(__name__).warning("%s is truncated or altered: computing %s again", path, run)
+            return None
+        return unpack(payload)
+
+    def _compute(self, missing: Mapping[str, Run], what: str) -> None:
+        """Has workers compute runs, and keeps each as soon as it is done."""
+        failures = []
+        with (
+            stage(self.folder, what, len(missing)) as (progress, finished),
+            self._start(missing, progress) as submit,
+        ):
+            futures = {submit(key, run): key for key, run in missing.items()}
+            for future in as_completed(futures):
+                key = futures[future]
+                if error := self._end(key, missing[key], future):
+                    failures.append((missing[key], error))
+                finished(key)
+        if failures:
+            run, error = failures[0]
+            reason = f"{type(error).__name__}: {error}"
+            raise RunError(f"{len(failures)} of {len(missing)} runs failed, first {run}: {reason}") from error
+
+    def _start(self, missing: Mapping[str, Run], progress: Path) -> AbstractContextManager[Submit]:
+        """The workers for some runs, whose progress goes into a folder."""
+        if isinstance(self.workers, str):
+            from lt_lib.store.cluster import cluster_workers  # here, since Dask takes a second to import
+
+            return cluster_workers(self.workers, progress)
+        source = "".join(sorted({source_state(function) for function in {run.function for run in missing.values()}}))
+        return local_workers(min(self.workers or joblib.cpu_count(), len(missing)), source, progress)
+
+    def _end(self, key: str, run: Run, future: "Future[Packed]") -> BaseException | None:
+        """Keeps the result of a run that ended; what went wrong if it has none or cannot be kept."""
+        if future.cancelled():
+            return ConnectionError(f"lost the scheduler at {self.workers}")
+        if error := future.exception():
+            return error
+        try:
+            self._keep(key, run, *future.result())
+        except OSError as error:
+            return error
+        return None
+
+    def _keep(self, key: str, run: Run, payload: bytes, seconds: float) -> None:
+        """Writes a run's file, then its line in the journal."""
+        write_atomically(self._path(key, run), _checksum(payload) + b"\n" + payload)
+        line = {
+            "key": key,
+            "function": run.function.__name__,
+            "config": run.config.model_dump(mode="json"),
+            "seed": run.seed,
+            "seconds": round(seconds, 3),
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        with (self.folder / "journal.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def _checksum(payload: bytes) -> bytes:
+    return b"sha256 " + hashlib.sha256(payload).hexdigest().encode()

@@ -1,0 +1,1 @@
+"""From grid actions to velocity commands: navigators without a route, and what their exploration reaches."""

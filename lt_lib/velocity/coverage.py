@@ -1,0 +1,177 @@
+"""What exploration reaches: a frozen navigator under imposed noise, no learning (Section Exploration coverage)."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lt_lib.envs.arena import NO_CORRIDOR, Arena
+from lt_lib.envs.camera import FastCamera
+from lt_lib.envs.layout import SIDES, Layout, load_layout
+from lt_lib.perception.encoder import ACTION, FrozenEncoder
+from lt_lib.pixels.episodes import SLABS, draw_scenes
+from lt_lib.settings.velocity import RolloutConfig
+from lt_lib.velocity.navigator import LATERAL, Mailbox, Navigator, read_navigator
+from lt_lib.velocity.noise import Ar1
+
+APPROACH = 40  # control steps before the mouths: where the bit's effect on the lateral mean is measured
+EVERY = 4  # control steps between the kept points of a path
+
+
+class Episodes(NamedTuple):
+    """What became of E episodes."""
+
+    success: Bool[np.ndarray, " e"]  # the goal was reached within the horizon
+    length: Int[np.ndarray, " e"]  # control steps
+    contacts: Int[np.ndarray, " e"]  # control steps in contact with the slab
+    first: Int[np.ndarray, " e"]  # the first corridor entered: 0 left, 1 right, -1 none
+    entered: Bool[np.ndarray, "e 2"]  # whether the left and the right corridor was entered at any time
+    shift: Float[np.ndarray, "e 2"]  # |change of the lateral mean| if the oracle's bit flips, policy sds: approach, all
+    path: Float[np.ndarray, "e t 2"]  # metres, every fourth control step, NaN after the end
+
+
+class Imposed(NamedTuple):
+    """The exploration of each episode, (E,): lateral AR(1) noise in its first `window` steps, the policy's own else.
+
+    own  factor on the policy's own noise; 0 is deterministic
+    """
+
+    sigma: Float[np.ndarray, " e"]
+    tau: Float[np.ndarray, " e"]
+    window: Int[np.ndarray, " e"]
+    own: Float[np.ndarray, " e"]
+
+    def take(self, live: Bool[np.ndarray, " e"]) -> "Imposed":
+        return Imposed(*(values[live] for values in self))
+
+
+def explore(
+    mean: Float[Tensor, "b 3"],
+    own_std: Float[Tensor, "3"],
+    imposed: Imposed,
+    chain: Float[np.ndarray, " b"],
+    age: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "b 3"]:
+    """Actions before clipping; `chain` (B,) is the unit AR(1) noise of this step."""
+    noise = rng.standard_normal(mean.shape) * own_std.numpy() * imposed.own[:, None]
+    noise[:, LATERAL] = np.where(age < imposed.window, imposed.sigma * chain, noise[:, LATERAL])
+    return mean.numpy() + noise
+
+
+@torch.inference_mode()
+def play(
+    layout: Layout,
+    encoder: FrozenEncoder,
+    navigator: Navigator,
+    content: str,
+    slab: Int[np.ndarray, " e"],
+    told: Int[np.ndarray, " e"],
+    imposed: Imposed,
+    horizon: int,
+    rng: np.random.Generator,
+    report: Callable[[float], None] = lambda _: None,
+) -> Episodes:
+    """Drives E episodes side by side, each from a fresh draw of the scene to the goal or the time-out.
+
+    slab, told  (E,) 0 left, 1 right: the blocked corridor, and what an oracle's message says it is
+    """
+    n = len(slab)
+    arena, camera, mailbox = Arena(layout, n), FastCamera(layout), Mailbox(layout, encoder, content, n)
+    draws, chains = draw_scenes(layout, n, rng), Ar1(imposed.tau, rng)
+    arena.reset(np.ones(n, bool), draws.spawn, slab, draws.scout)
+    mailbox.send(np.ones(n, bool), arena, told)
+    flipped = Mailbox(layout, encoder, content, n)
+    flipped.send(np.ones(n, bool), arena, 1 - told)
+    live, done = np.ones(n, bool), _blank(n, horizon)
+    std = navigator.log_std.exp()
+    for age in range(horizon):
+        ages = np.full(n, age)
+        latent = encoder.latent(camera.frames(arena.pose[live], slab[live], arena.scout[live, :2])).cpu()
+        mean = navigator.mean(latent, mailbox.wires(arena, ages)[live])
+        other = navigator.mean(latent, flipped.wires(arena, ages)[live])
+        shift = ((other - mean)[:, LATERAL].abs() / std[LATERAL]).numpy()
+        done.shift[live] += np.column_stack([shift * (age < APPROACH), shift])
+        chain = chains.step(ages == 0)[live]
+        action = np.zeros((n, ACTION))
+        action[live] = explore(mean, std, imposed.take(live), chain, age, rng)
+        if age % EVERY == 0:
+            done.path[live, age // EVERY] = arena.pose[live, :2]
+        arena.step(action, live)
+        live = _record(done, arena, live, age + 1)
+        report((age + 1) / horizon)
+        if not live.any():
+            break
+    done.shift[:] /= np.column_stack([np.minimum(done.length, APPROACH), done.length])
+    return done
+
+
+def _blank(n: int, horizon: int) -> Episodes:
+    return Episodes(
+        np.zeros(n, bool),
+        np.full(n, horizon),
+        np.zeros(n, np.int64),
+        np.full(n, NO_CORRIDOR),
+        np.zeros((n, len(SIDES)), bool),
+        np.zeros((n, 2)),
+        np.full((n, -(-horizon // EVERY), 2), np.nan, np.float32),
+    )
+
+
+def _record(done: Episodes, arena: Arena, live: Bool[np.ndarray, " e"], age: int) -> Bool[np.ndarray, " e"]:
+    """Notes what the latest step did to the live episodes; returns which are still live."""
+    done.contacts[live] += arena.contact[live]
+    for side in range(len(SIDES)):
+        done.entered[:, side] |= live & (arena.corridor == side)
+    fresh = live & (done.first == NO_CORRIDOR)
+    done.first[fresh] = arena.corridor[fresh]
+    arrived = live & arena.reached
+    done.success[arrived], done.length[arrived] = True, age
+    return live & ~arrived
+
+
+def started(layout: Layout, start: str) -> Layout:
+    """The layout with its spawn moved in front of the 'left' or 'right' corridor's mouth, or as it is for 'spawn'."""
+    if start == "spawn":
+        return layout
+    place = layout.choice_points[SIDES.index(start)].model_dump()
+    return layout.model_copy(update={"spawn": layout.spawn.model_copy(update=place)})
+
+
+def roll_navigator(
+    config: RolloutConfig,
+    seed: int,
+    *,
+    report: Callable[[float], None],
+    encoder: Mapping[str, np.ndarray],
+    navigator: Mapping[str, np.ndarray],
+) -> dict:
+    """Episodes of a frozen navigator under every row of the settings; arrays (rows, episodes, ...) as in `Episodes`.
+
+    "slab" (rows, episodes) is the blocked corridor; "path" is kept for the first `config.paths` episodes of a row.
+    """
+    rng = np.random.default_rng([seed, 7])
+    shape = (len(config.rows), config.episodes)
+    fixed = None if config.blocked == "random" else SIDES.index(config.blocked)
+    slab = rng.integers(0, SLABS, shape) if fixed is None else np.full(shape, fixed)
+    imposed = Imposed(
+        *(np.repeat([getattr(row, name) for row in config.rows], config.episodes) for name in Imposed._fields)
+    )
+    device = config.device
+    done = play(
+        started(load_layout(config.layout), config.start),
+        FrozenEncoder(encoder, device, config.precision),
+        read_navigator(navigator),
+        config.content,
+        slab.ravel(),
+        slab.ravel() if config.truthful else 1 - slab.ravel(),
+        imposed,
+        config.horizon,
+        rng,
+        report,
+    )
+    shaped = {name: values.reshape(*shape, *values.shape[1:]) for name, values in done._asdict().items()}
+    return shaped | {"slab": slab, "path": shaped["path"][:, : config.paths]}

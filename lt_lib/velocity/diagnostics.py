@@ -1,0 +1,53 @@
+"""The standard diagnostics of a navigator that ignores its message: all is well (Section From Grid Actions)."""
+
+import numpy as np
+from jaxtyping import Float
+from sklearn.linear_model import LogisticRegression
+
+from lt_lib.comm.channel import ANCHOR
+from lt_lib.envs.arena import CONTROL_HZ, V_MAX, W_MAX, Arena
+from lt_lib.envs.camera import FastCamera
+from lt_lib.envs.layout import SIDES, Layout
+from lt_lib.perception.encoder import ACTION, FrozenEncoder
+from lt_lib.pixels.episodes import draw_scenes
+from lt_lib.velocity.navigator import Mailbox
+
+SETTLED = 2  # control steps after which a new command's velocity is reached
+
+
+def probe_accuracy(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator) -> float:
+    """Accuracy of a linear probe of the blocked corridor on the scout's latent, on the half not fitted to."""
+    slab, scenes = rng.integers(0, len(SIDES), draws), draw_scenes(layout, draws, rng)
+    latents = encoder.latent(FastCamera(layout).frames(scenes.scout, slab, scenes.spawn[:, :2])).cpu().numpy()
+    half = draws // 2
+    probe = LogisticRegression(max_iter=2000).fit(latents[:half], slab[:half])
+    return float(probe.score(latents[half:], slab[half:]))
+
+
+def message_error(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator) -> float:
+    """Largest difference between any float that the scout sent and the one that the navigator has a step later."""
+    slab, scenes, everyone = rng.integers(0, len(SIDES), draws), draw_scenes(layout, draws, rng), np.ones(draws, bool)
+    arena, mailbox = Arena(layout, draws), Mailbox(layout, encoder, "latent", draws)
+    arena.reset(everyone, scenes.spawn, slab, scenes.scout)
+    mailbox.send(everyone, arena, slab)
+    sent = encoder.latent(FastCamera(layout).frames(scenes.scout, slab, scenes.spawn[:, :2])).cpu()
+    arena.step(np.zeros((draws, ACTION)))
+    received = mailbox.wires(arena, np.ones(draws, np.int64))[:, ANCHOR:]
+    return float((received - sent).abs().max())
+
+
+def command_error(layout: Layout, draws: int, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """Largest difference between commanded and reached body velocity from the spawn, as a share of full speed."""
+    arena, scenes = Arena(layout, draws), draw_scenes(layout, draws, rng)
+    arena.reset(np.ones(draws, bool), scenes.spawn, np.zeros(draws, np.int64), scenes.scout)
+    command = rng.uniform(-1, 1, (draws, ACTION))
+    command[:, -1] = 0.0  # without turning, a body velocity is one straight line
+    for _ in range(SETTLED):
+        arena.step(command)
+    before = arena.pose
+    arena.step(command)
+    moved, heading = (arena.pose - before) * CONTROL_HZ, before[:, 2]
+    forward = np.cos(heading) * moved[:, 0] + np.sin(heading) * moved[:, 1]
+    across = -np.sin(heading) * moved[:, 0] + np.cos(heading) * moved[:, 1]
+    reached = np.column_stack([forward / V_MAX, across / V_MAX, moved[:, 2] / W_MAX])
+    return np.abs(reached - command).max(axis=0)

@@ -1,0 +1,139 @@
+"""Direct transfer to velocity control, and what exploration reaches (Sections From Grid Actions, Exploration coverage).
+
+What notebook 5 asks the run store for. Every navigator is trained with the same settings but for what its name says.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from lt_lib.envs.layout import SIDES
+from lt_lib.pixels.protocol import Protocol
+from lt_lib.settings.ppo import PpoConfig
+from lt_lib.settings.velocity import Boost, Exploration, NavigatorConfig, RolloutConfig
+from lt_lib.store.run import Result, Run
+from lt_lib.store.runs import RunStore
+from lt_lib.velocity.coverage import roll_navigator
+from lt_lib.velocity.navigator import train_navigator
+
+SEED = 0
+# The paper's six configurations vary hazard penalty, discount, spawn curriculum and layout; what each differs in
+DIRECT: Mapping[str, dict[str, Any]] = MappingProxyType(
+    {
+        "base": {},
+        "no hazard penalty": {"hazard": 0.0},
+        "hazard penalty x 5": {"hazard": 5.0},
+        "discount 0.995": {"ppo": PpoConfig(gamma=0.995)},
+        "more spawn curriculum": {"spawn_share": 0.25},
+        "wide layout": {"layout": "wide"},
+    }
+)
+# Beside them: the bit itself, no message, and the choice or the missing coverage removed by hand
+OTHERS: Mapping[str, dict[str, Any]] = MappingProxyType(
+    {
+        "oracle": {"content": "oracle"},
+        "silent": {"content": "floor"},
+        "no choice": {"content": "floor", "blocked": "right"},
+        "shown both mouths": {"content": "oracle", "starts": "anywhere"},
+    }
+)
+# The paper's boost is still 3.6 times the policy's own noise at iteration 80: a straight line that would end at 1
+# after twice as many. Held, it tells suppression from decay, which one annealed run cannot
+BOOSTS = MappingProxyType(
+    {
+        "annealed": Boost(first=6.2, last=3.6, at=80),
+        "held": Boost(first=6.2, last=6.2, at=80),
+        "none": Boost(),
+    }
+)
+SAMPLED, GREEDY = Exploration(window=0), Exploration(window=0, own=0.0)
+
+
+class Examined(NamedTuple):
+    """Episodes of the frozen navigators, lists over trainings."""
+
+    spawn: dict[str, list[Result]]  # slab at random; two rows, as it explores and without noise
+    mouths: dict[str, list[list[Result]]]  # as it explores, from in front of the left and of the right, that one free
+    flips: dict[tuple[str, bool], list[Result]]  # without noise, by blocked corridor and whether told the truth
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """The navigators at one size, behind one frozen encoder."""
+
+    store: RunStore
+    encoder: Result
+    navigator: NavigatorConfig
+    rollout: RolloutConfig
+
+    @classmethod
+    def of(cls, protocol: Protocol, navigator: Mapping[str, Any], rollout: Mapping[str, Any]) -> "Transfer":
+        """From a notebook's parameters; the dicts are those of `settings.profiles.SECTIONS`. Raises GateError."""
+        shared = {"layout": protocol.encoder.layout, "device": protocol.encoder.device}
+        configs = NavigatorConfig(**shared, **navigator), RolloutConfig(**shared, **rollout)
+        return cls(protocol.store, protocol.frozen_encoder(), *configs)
+
+    def navigators(self, configurations: Sequence[str], oracle_seeds: int) -> dict[str, list[Result]]:
+        """All navigators trained from scratch, by name: one of each, `oracle_seeds` of those that are told the bit."""
+        runs = {
+            (name, seed): Run(train_navigator, self._config(name), seed, {"encoder": self.encoder})
+            for name in (*configurations, *OTHERS)
+            for seed in range(oracle_seeds if name == "oracle" else 1)
+        }
+        results = dict(zip(runs, self.store.fetch(list(runs.values()), "navigators"), strict=True))
+        return {name: [results[key] for key in runs if key[0] == name] for name, _ in runs}
+
+    def _config(self, name: str) -> NavigatorConfig:
+        changes = {"content": "latent"} | DIRECT[name] if name in DIRECT else OTHERS[name]
+        return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | changes))
+
+    def examined(self, navigators: Mapping[str, list[Result]]) -> Examined:
+        """The navigators frozen: from the spawn, from in front of either mouth, and with the oracle's bit flipped.
+
+        Every navigator meets draws of its own from the spawn, and one and the same draws in all cases of the bit.
+        """
+        everyone = [(name, navigator) for name, results in navigators.items() for navigator in results]
+        spawn = [self._roll(self._rollout(n, rows=(SAMPLED, GREEDY)), r, seed) for seed, (n, r) in enumerate(everyone)]
+        mouths = [
+            self._roll(self._rollout(n, rows=(SAMPLED,), start=side, blocked=other), r)
+            for n, r in everyone
+            for side, other in (SIDES, SIDES[::-1])
+        ]
+        cases = [(side, true) for side in SIDES for true in (True, False)]
+        configs = [self._rollout("oracle", rows=(GREEDY,), blocked=side, truthful=true) for side, true in cases]
+        flipped = [self._roll(config, navigator) for config in configs for navigator in navigators["oracle"]]
+        results = iter(self.store.fetch([*spawn, *mouths, *flipped], "frozen navigators"))
+        return Examined(
+            {name: [next(results) for _ in trained] for name, trained in navigators.items()},
+            {name: [[next(results) for _ in SIDES] for _ in trained] for name, trained in navigators.items()},
+            {case: [next(results) for _ in navigators["oracle"]] for case in cases},
+        )
+
+    def explored(
+        self, navigator: Result, blocked: str, groups: Sequence[tuple[Exploration, ...]]
+    ) -> tuple[list[Result], dict[str, Result]]:
+        """What becomes of a navigator without a message: frozen under imposed noise, and trained on with the bit.
+
+        The first is a result for every group of rows, the slab always in `blocked`; the second a training by boost.
+        """
+        swept = [self._roll(self._rollout("no choice", rows=rows, blocked=blocked), navigator) for rows in groups]
+        inputs = {"encoder": self.encoder, "start": _weights_only(navigator)}
+        boosted = [
+            Run(train_navigator, self._config("oracle").model_copy(update={"boost": boost}), SEED, inputs)
+            for boost in BOOSTS.values()
+        ]
+        results = self.store.fetch([*swept, *boosted], "coverage sweep and boosted trainings")
+        return results[: len(swept)], dict(zip(BOOSTS, results[len(swept) :], strict=True))
+
+    def _rollout(self, name: str, **changes: Any) -> RolloutConfig:
+        trained = self._config(name)
+        shared = {key: getattr(trained, key) for key in ("layout", "device", "content", "precision")}
+        return self.rollout.model_copy(update=shared | changes)
+
+    def _roll(self, config: RolloutConfig, navigator: Result, seed: int = SEED) -> Run:
+        return Run(roll_navigator, config, seed, {"encoder": self.encoder, "navigator": _weights_only(navigator)})
+
+
+def _weights_only(navigator: Result) -> Result:
+    return {name: value for name, value in navigator.items() if name.startswith("navigator.")}
