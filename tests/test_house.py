@@ -15,8 +15,6 @@ from lt_lib.settings.profiles import notebook_names
 STUDIES = ("pixels", "velocity", "gridworld", "learnability", "hardware", "speed", "environments")
 SHARED = {"settings": 0, "store": 1, "envs": 2, "perception": 3, "comm": 4, "ppo": 4, "report": 5}
 FLOORS = SHARED | dict.fromkeys(STUDIES, 6)
-    STUDIES, 6
-)
 LONGEST_CELL = 36
 LONGEST_FUNCTION = 60
 LONGEST_FULL_RUN_S = 2 * 3600
