@@ -136,8 +136,9 @@ def ended_by_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def kernels_environment(plan: Plan) -> Iterator[None]:
-    """What notebooks find in their environment: the folder of runs, and no backend, since figures need none."""
-    with mock.patch.dict(os.environ, {"LT_RUNS": str(plan.runs)}):
+    """What notebooks find in their environment: this library, the folder of runs, no backend (figures need none)."""
+    library = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    with mock.patch.dict(os.environ, {"LT_RUNS": str(plan.runs), "PYTHONPATH": library}):
         os.environ.pop("MPLBACKEND", None)
         yield
 

@@ -15,7 +15,7 @@ from lt_lib.settings.velocity import Boost, Configuration, NavigatorConfig, Roll
 from lt_lib.velocity import coverage_figures as coverage, transfer_figures as transfer
 from lt_lib.velocity.coverage import Imposed, explore, play, started
 from lt_lib.velocity.diagnostics import command_error, message_error
-from lt_lib.velocity.navigator import LATERAL, Errand, Mailbox, Navigator, annealed, train_navigator
+from lt_lib.velocity.navigator import LATERAL, Errand, Navigator, Scouts, annealed, train_navigator
 from lt_lib.velocity.noise import Ar1
 from lt_lib.velocity.transfer import BOOSTS, DIRECT, OTHERS
 
@@ -108,16 +108,19 @@ def test_the_boost_is_the_paper_s_at_iteration_80_and_never_less_than_none():
     assert {annealed(BOOSTS["held"], i) for i in (1, 80)} == {BOOSTS["held"].first}
 
 
-def test_a_message_is_late_by_the_latency_and_held_while_its_anchor_moves(encoder):
+@pytest.mark.parametrize("latency", [0, 1, 3])
+def test_a_message_is_late_by_the_latency_and_held_while_its_anchor_moves(encoder, latency):
     n, rng = 6, np.random.default_rng(0)
-    arena, mailbox, scenes = Arena(LAYOUT, n), Mailbox(LAYOUT, encoder, "oracle", n), draw_scenes(LAYOUT, n, rng)
+    arena, scouts = Arena(LAYOUT, n), Scouts(LAYOUT, encoder, "oracle", n, latency)
+    scenes = draw_scenes(LAYOUT, n, rng)
     slab, everyone = np.arange(n) % 2, np.ones(n, bool)
     arena.reset(everyone, scenes.spawn, slab, scenes.scout)
-    mailbox.send(everyone, arena, 1 - slab)  # the truth is not what it is told
-    assert (mailbox.wires(arena, np.zeros(n, np.int64)) == 0).all()
-    first = mailbox.wires(arena, np.ones(n, np.int64))
+    scouts.look(everyone, arena, 1 - slab)  # the truth is not what it is told
+    for age in range(latency):
+        assert (scouts.wires(arena, np.full(n, age)) == 0).all()
+    first = scouts.wires(arena, np.full(n, latency))
     arena.step(np.tile([1.0, 0.0, 0.0], (n, 1)))
-    second = mailbox.wires(arena, np.full(n, 2))
+    second = scouts.wires(arena, np.full(n, latency + 1))
     assert torch.equal(first[:, ANCHOR], torch.from_numpy(1 - slab).float())
     assert torch.equal(first[:, ANCHOR:], second[:, ANCHOR:]) and not torch.equal(first[:, 0], second[:, 0])
 

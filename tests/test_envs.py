@@ -3,12 +3,10 @@
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-from lt_lib.comm.channel import LATENCY, deliver
 from lt_lib.comm.messages import CONTENT
 from lt_lib.environments import gym
 from lt_lib.environments.gym import ArenaEnv, ArenaVectorEnv
@@ -161,8 +159,9 @@ def test_rows_end_at_times_of_their_own():
 # --- the team
 
 
-def test_a_message_arrives_one_step_late_with_the_anchor_of_its_arrival(layout):
-    env, rng = TeamEnv(), np.random.default_rng(0)
+@pytest.mark.parametrize("latency", [1, 3])
+def test_a_message_arrives_late_by_the_latency_with_the_anchor_of_its_arrival(layout, latency):
+    env, rng, sent = TeamEnv(latency=latency), np.random.default_rng(0), []
     observed, _ = env.reset(seed=3)
     assert not observed[NAVIGATOR]["wire"].any()
     arena = env._scenes.arena
@@ -171,13 +170,23 @@ def test_a_message_arrives_one_step_late_with_the_anchor_of_its_arrival(layout):
         before = observed[NAVIGATOR]["wire"].copy()
         later = env.step({NAVIGATOR: action, SCOUT: message})[0]
         np.testing.assert_array_equal(observed[NAVIGATOR]["wire"], before)  # what was handed out stays
-        sent = torch.from_numpy(message)[None]
-        wire = deliver(sent, arena.scout[:, :2], arena.pose[:, :2], layout.communication_radius)[0].numpy()
-        np.testing.assert_array_equal(later[NAVIGATOR]["wire"], wire)
-        np.testing.assert_array_equal(later[NAVIGATOR]["wire"][2:], message)
+        sent.append(message)
+        wire = later[NAVIGATOR]["wire"]
+        if len(sent) < latency:
+            assert not wire.any()
+        else:
+            offset = (arena.scout[0, :2] - arena.pose[0, :2]) / layout.communication_radius
+            np.testing.assert_array_equal(wire[:2], offset.astype(np.float32))
+            np.testing.assert_array_equal(wire[2:], sent[-latency])
         observed = later
-    assert LATENCY == 1  # which is what the loop above has seen
     assert not env.reset()[0][NAVIGATOR]["wire"].any()
+
+
+def test_a_message_cannot_arrive_before_it_is_sent():
+    with pytest.raises(
+        UserError, match="^latency: expected 1 or more control steps, since a message is an action, got 0$"
+    ):
+        TeamEnv(latency=0)
 
 
 def test_the_team_shares_scene_reward_and_end_with_the_lone_navigator(layout):

@@ -6,7 +6,7 @@ import torch
 import yaml
 
 from lt_lib import ppo
-from lt_lib.comm.channel import CORRUPTIONS, deliver
+from lt_lib.comm.channel import CORRUPTIONS, Channel, measured_latency
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.camera import FastCamera
@@ -152,12 +152,45 @@ def test_trajectory_is_the_straight_line_that_position_starts():
     np.testing.assert_allclose(sent, path, **EXACT)
 
 
-def test_channel_adds_the_anchor_and_is_silent_out_of_range():
-    content = torch.ones(2, 64)
-    sender, receiver = np.array([[3.0, 4.0], [30.0, 0.0]]), np.zeros((2, 2))
-    wire = deliver(content, sender, receiver, radius=10.0)
+@pytest.mark.parametrize("latency", [0, 1, 3])
+def test_an_impulse_arrives_after_the_latency_and_at_no_other_step(latency):
+    assert measured_latency(latency) == latency
+    channel, shown = Channel((2,), 3, 10.0, latency), []
+    for step in range(12):  # the second team's clock runs five steps behind
+        steps = np.array([step, step - 5])
+        channel.send(steps, torch.from_numpy(steps == 4).float()[:, None].expand(2, 3), np.ones((2, 2)))
+        shown.append(channel.receive(steps, np.zeros((2, 2)))[:, 2:].any(dim=1))
+    first, second = torch.stack(shown).T
+    assert first.nonzero().flatten().tolist() == [4 + latency]
+    assert second.nonzero().flatten().tolist() == [step for step in [9 + latency] if step < 12]
+
+
+def test_a_channel_adds_the_anchor_on_arrival_and_is_silent_out_of_range_or_before():
+    channel, sender = Channel((2,), 64, 10.0), np.array([[3.0, 4.0], [30.0, 0.0]])
+    assert (channel.receive(0, np.zeros((2, 2))) == 0).all()
+    channel.send(0, torch.ones(2, 64), sender)
+    wire = channel.receive(1, np.array([[0.0, 0.0], [1.0, 0.0]]))
     torch.testing.assert_close(wire[0, :2], torch.tensor([0.3, 0.4]))
     assert (wire[0, 2:] == 1).all() and (wire[1] == 0).all()
+    near = channel.receive(1, np.array([[0.0, 0.0], [25.0, 0.0]]))
+    torch.testing.assert_close(near[1, :2], torch.tensor([0.5, 0.0]))
+    assert (channel.receive(2, np.zeros((2, 2))) == 0).all()  # nothing was sent at step 1
+
+
+def test_each_of_many_senders_has_an_anchor_and_a_range_of_its_own():
+    channel = Channel((1, 3), 2, 10.0, corrupt=lambda wires: 2 * wires)
+    channel.send(4, torch.arange(6.0).view(1, 3, 2), np.array([[[1.0, 0.0], [0.0, 20.0], [-2.0, 0.0]]]))
+    wires = channel.receive(5, np.array([[1.0, 0.0]]))
+    expected = torch.tensor([[[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0], [-0.3, 0.0, 4.0, 5.0]]])
+    torch.testing.assert_close(wires, 2 * expected)
+
+
+def test_a_row_that_sends_alone_leaves_the_others_in_flight():
+    channel = Channel((2,), 1, 10.0)
+    channel.send(0, torch.ones(2, 1), np.zeros((2, 2)))
+    channel.send(0, torch.full((1, 1), 7.0), np.zeros((1, 2)), rows=np.array([1]))
+    assert channel.receive(1, np.zeros((2, 2)))[:, 2].tolist() == [1.0, 7.0]
+    assert channel.receive(np.array([1]), np.zeros((1, 2)), rows=np.array([1]))[:, 2].tolist() == [7.0]
 
 
 def test_corruptions_do_what_their_names_say():
@@ -199,7 +232,8 @@ def ideal_bank(n: int) -> dict[str, np.ndarray]:
     free = np.broadcast_to(np.array([[False, True], [True, False]]), (n, 2, 2))
     route = np.broadcast_to(np.arange(2), (n, 2, 2))
     length, contacts = np.where(free, 200, 600), np.where(free, 0, 400)
-    return draws._asdict() | {"success": free, "length": length, "contacts": contacts, "entered": route}
+    outcomes = {"success": free, "length": length, "contacts": contacts, "entered": route}
+    return draws._asdict() | outcomes | {"commit_step": 2, "held_out": 0.125}
 
 
 @pytest.mark.parametrize(

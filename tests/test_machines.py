@@ -22,7 +22,7 @@ from toy_project import COMPUTE, LIMIT_S, WRITE, journal, losses, smoke, write_n
 
 from lt_lib.envs.opengl import install_line
 from lt_lib.perception.jepa import train_encoder
-from lt_lib.pixels.protocol import Protocol
+from lt_lib.pixels.protocol import PixelProtocol
 from lt_lib.settings.base import ROOT, UserError
 from lt_lib.settings.devices import computing_device
 from lt_lib.settings.perception import EncoderConfig
@@ -215,10 +215,29 @@ def test_a_notebook_of_another_checkout_is_refused_in_one_line(checkout, monkeyp
     require_own_checkout(ROOT / "notebooks")
 
 
+def test_run_all_runs_a_notebook_with_the_library_of_its_own_checkout(checkout):
+    notebook(
+        checkout,
+        "from lt_lib.store.files import outputs_folder\nfolder = outputs_folder(outputs, profile)",
+        WRITE_ALONE,
+    )
+    for name in ("run_all.py", "requirements.txt"):
+        shutil.copy2(ROOT / name, checkout / name)
+    command = [sys.executable, "run_all.py", "--profile", "smoke"]
+    (checkout / "params" / "smoke.yaml").write_text("")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}  # the other one's
+    ended = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert (checkout / "outputs" / "smoke" / "results" / "01_toy.json").exists()
+
+
 def test_pytest_runs_a_notebook_with_the_library_of_its_own_checkout(checkout):
     notebook(checkout, f"import lt_lib\nassert lt_lib.__path__ == [{str(checkout / 'lt_lib')!r}], lt_lib.__path__")
     ended = pytest_in(checkout)
     assert ended.returncode == 0, ended.stdout[-2000:]
+
+
+WRITE_ALONE = """(folder / "results" / "01_toy.json").write_text("[]")"""
 
 
 def notebook(root: Path, *cells: str) -> None:
@@ -310,7 +329,7 @@ def test_a_run_s_key_holds_the_device_that_computes_it(monkeypatch):
     for there, device in ((False, "cpu"), (True, "cuda")):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         assert computing_device("auto") == device
-        config = Protocol.of("default", "auto", 0, encoder={"frames": 64}).encoder
+        config = PixelProtocol.of({"encoder": {"frames": 64}}, "default", "auto", 0).sizes.encoder
         assert config.device == device
         keys[device] = Run(train_encoder, config, 0).key()
     assert keys["cpu"] != keys["cuda"]

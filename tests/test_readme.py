@@ -70,6 +70,7 @@ layout = load_layout("default")
 encoder = load_frozen(Path("outputs/full/weights"), "encoder", layout)
 entry, slab, route = np.indices((64, 2, 2))
 ended = {"success": slab != route, "length": 0 * slab, "contacts": 0 * slab, "entered": route}
+ended |= {"commit_step": 2, "held_out": 0.125}
 bank = draw_scenes(layout, 64, np.random.default_rng(0))._asdict() | ended
 def train(content, wire="intact"):
     config = HeadConfig(content=content, wire=wire, episodes=3000)

@@ -8,7 +8,6 @@ import torch
 import yaml
 
 from lt_lib import ppo
-from lt_lib.comm.channel import deliver
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
@@ -17,14 +16,15 @@ from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.pixels import episodes, redraw
 from lt_lib.pixels.episodes import Outcomes, draw_scenes, drive, roll_bank
 from lt_lib.pixels.executor import Executor, FrozenExecutor
-from lt_lib.pixels.redraw import CREDITS, REDRAWS, Decisions, LiveArena, draws_an_episode, train_redrawn_head
+from lt_lib.pixels.redraw import CREDITS, REDRAWS, Decisions, LiveArena, draws_per_episode, train_redrawn_head
 from lt_lib.pixels.redraw_figures import fall_test
 from lt_lib.pixels.route import train_head
 from lt_lib.settings.base import layout_path
 from lt_lib.settings.pixels import BankConfig, HeadConfig, RedrawConfig
 from lt_lib.settings.ppo import PpoConfig
 
-ROWS = redraw.BLOCK  # the batches of `drive` and the blocks of the live code then have one size
+ROWS = redraw.FRAMES_AT_ONCE  # the batches of `drive` and the blocks of the live code then have one size
+COMMIT_STEP = 2
 SHORT = 45  # control steps, in place of 600
 
 
@@ -83,18 +83,20 @@ def some_head(seed: int = 0) -> RouteHead:
 def some_episodes(path: str, n: int, config: RedrawConfig, seed: int = 0):
     rng = np.random.default_rng(seed)
     draws, slab = draw_scenes(load_layout(path), n, rng), rng.integers(0, 2, n)
-    return draws, slab, rng.random((n, draws_an_episode(config)))
+    return draws, slab, rng.random((n, draws_per_episode(config.every, COMMIT_STEP)))
 
 
 def test_one_draw_an_episode_is_the_bank_s_episode_exactly(frozen, near):
     config = RedrawConfig(layout=near, envs=ROWS)
     draws, slab, chance = some_episodes(near, 30, config)
-    outcome, decisions = LiveArena(config, frozen.encoder, frozen.executor).play(some_head(), draws, slab, chance)
+    outcome, decisions = LiveArena(config, COMMIT_STEP, frozen.encoder, frozen.executor).play(
+        some_head(), draws, slab, chance
+    )
     np.testing.assert_array_equal(decisions.episode, np.arange(30))
     route = decisions.routes.numpy()
     assert 5 < route.sum() < 25
     encoder, executor = FrozenEncoder(frozen.encoder), FrozenExecutor(frozen.executor)
-    expected = drive(load_layout(near), encoder, executor, draws, slab, route, envs=ROWS, commit_step=2)
+    expected = drive(load_layout(near), encoder, executor, draws, slab, route, envs=ROWS, commit_step=COMMIT_STEP)
     for name, values in expected._asdict().items():
         np.testing.assert_array_equal(getattr(outcome, name), values, err_msg=name)
     assert outcome.success.any() and not outcome.success.all()
@@ -102,9 +104,13 @@ def test_one_draw_an_episode_is_the_bank_s_episode_exactly(frozen, near):
 
 def test_training_with_one_draw_an_episode_is_training_on_the_bank(frozen, near):
     bank = roll_bank(
-        BankConfig(layout=near, entries=4, envs=ROWS), 0, report=quiet, encoder=frozen.encoder, executor=frozen.executor
+        BankConfig(layout=near, entries=4, envs=ROWS, held_out=0.25),
+        0,
+        report=quiet,
+        encoder=frozen.encoder,
+        executor=frozen.executor,
     )
-    sizes = {"layout": near, "episodes": 40, "batch": 16, "minibatch": 8, "held_out": 0.25}
+    sizes = {"layout": near, "episodes": 40, "batch": 16, "minibatch": 8}
     on_bank = train_head(HeadConfig(**sizes), 3, report=quiet, bank=bank, encoder=frozen.encoder)
     live = train_redrawn_head(
         RedrawConfig(**sizes, envs=ROWS), 3, report=quiet, scenes=bank, encoder=frozen.encoder, executor=frozen.executor
@@ -116,20 +122,22 @@ def test_training_with_one_draw_an_episode_is_training_on_the_bank(frozen, near)
     assert live["entropy"][-1] < live["entropy"][0] - 1e-3  # it did learn something
 
 
-def literal_episode(path, frozen, head, spawn, scout, slab, chance, every):
+def literal_episode(path, frozen, head, spawn, scout, slab, chance, every, latency):
     """One episode, one row, nothing remembered: every frame rendered and encoded, every message sent."""
     layout = load_layout(path)
     arena, camera = Arena(layout, 1), FastCamera(layout)
     encoder, executor = FrozenEncoder(frozen.encoder), FrozenExecutor(frozen.executor)
     arena.reset(np.ones(1, bool), spawn[None], np.array([slab]), scout[None])
-    message, route, entered, contacts, log, rewards = None, 0, -1, 0, [], []
+    route, entered, contacts, log, rewards, sent = 0, -1, 0, [], [], {}
     for step in range(SHORT):
+        sent[step] = encoder.latent(camera.frames(scout[None], arena.slab, arena.pose[:, :2]))
         if step >= 2 and (step - 2) % every == 0:
-            wire = deliver(message, scout[None, :2], arena.pose[:, :2], layout.communication_radius)
+            offset = torch.from_numpy((scout[None, :2] - arena.pose[:, :2]) / layout.communication_radius).float()
+            late = sent.get(step - latency)
+            wire = torch.zeros(1, 66) if late is None else torch.cat([offset, late], dim=1)
             route = int(chance[(step - 2) // every] < head.policy(wire).probs[0, 1].item())
             log.append((wire[0], route))
             rewards.append(0.0)
-        message = encoder.latent(camera.frames(scout[None], arena.slab, arena.pose[:, :2]))
         own = encoder.latent(camera.frames(arena.pose, arena.slab, scout[None, :2]))
         arena.step(executor.mean_action(own, np.array([route])) if step >= 2 else np.zeros((1, 3)))
         contacts += int(arena.contact[0])
@@ -142,15 +150,15 @@ def literal_episode(path, frozen, head, spawn, scout, slab, chance, every):
     return (arena.reached[0], step + 1, contacts, entered), log, rewards
 
 
-@pytest.mark.parametrize("every", [7, 1])
-def test_live_episodes_are_those_of_a_literal_loop_whatever_runs_beside_them(every, frozen, seen):
-    config, head = RedrawConfig(layout=seen, every=every, envs=ROWS), some_head(1)
+@pytest.mark.parametrize(("every", "latency"), [(7, 1), (1, 1), (7, 0), (7, 3), (1, 3)])
+def test_live_episodes_are_those_of_a_literal_loop_whatever_runs_beside_them(every, latency, frozen, seen):
+    config, head = RedrawConfig(layout=seen, every=every, envs=ROWS, latency=latency), some_head(1)
     draws, slab, chance = some_episodes(seen, ROWS + 9, config)  # more than rows: some are seated later
-    outcome, decisions = LiveArena(config, frozen.encoder, frozen.executor).play(head, draws, slab, chance)
+    outcome, decisions = LiveArena(config, COMMIT_STEP, frozen.encoder, frozen.executor).play(head, draws, slab, chance)
     moved = 0.0
     for e in (0, 5, ROWS + 8):
         ended, log, rewards = literal_episode(
-            seen, frozen, head, draws.spawn[e], draws.scout[e], slab[e], chance[e], every
+            seen, frozen, head, draws.spawn[e], draws.scout[e], slab[e], chance[e], every, latency
         )
         assert tuple(values[e] for values in outcome) == ended
         mine = decisions.episode == e
@@ -167,7 +175,7 @@ def test_how_many_rows_play_makes_no_difference(frozen, seen):
     config = RedrawConfig(layout=seen, every=5, envs=ROWS)
     draws, slab, chance = some_episodes(seen, 24, config)
     few, many = (
-        LiveArena(config.model_copy(update={"envs": envs}), frozen.encoder, frozen.executor).play(
+        LiveArena(config.model_copy(update={"envs": envs}), COMMIT_STEP, frozen.encoder, frozen.executor).play(
             some_head(), draws, slab, chance
         )
         for envs in (ROWS, 2 * ROWS)
@@ -224,9 +232,10 @@ def test_an_update_takes_as_many_gradient_steps_however_often_the_route_is_drawn
 
 def test_nothing_but_the_redraw_differs_from_the_heads_on_the_bank():
     mine, head, bank = RedrawConfig(), HeadConfig(), BankConfig()
-    for name in ("held_out", "episodes", "batch", "minibatch", "lr", "ppo"):
+    for name in ("latency", "episodes", "batch", "minibatch", "lr", "ppo"):
         assert getattr(mine, name) == getattr(head, name)
-    assert (mine.envs, mine.commit_step) == (bank.envs, bank.commit_step)
+    assert mine.envs == bank.envs
+    assert {"held_out", "commit_step"} <= set(redraw.SCENES)  # the bank's own
     rows = {(row.content, row.every, row.credit) for name, row in REDRAWS.items() if not name.endswith("gae")}
     assert rows == {
         (content, k, mine.credit) for content, k in (("latent", 0), ("latent", 30), ("latent", 1), ("oracle", 1))

@@ -1,33 +1,111 @@
-"""The channel, identical for every content: anchor, range, one step of latency (Section Broadcast and anchor).
+"""The channel, the same for every content: anchor, range, latency (Section Broadcast and anchor).
 
-A message sent at step t - 1 arrives at step t, when its anchor is added. `CORRUPTIONS` are what can happen to the
-wire on the way (Section Corruption controls); 'intact' is the channel as it is.
+`CORRUPTIONS` are what can happen to a wire on its way (Section Corruption controls); 'intact' is the channel as it is.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-ANCHOR = 2
-LATENCY = 1  # control steps
+from lt_lib.settings.base import LATENCY
+
+ANCHOR = 2  # floats
+NEVER = np.iinfo(np.int64).min  # no step at which anything was sent
 
 
-def anchor(sender: Float[np.ndarray, "b 2"], receiver: Float[np.ndarray, "b 2"], radius: float) -> Float[Tensor, "b 2"]:
+class Channel:
+    """Messages in flight, of many senders side by side, each to one receiver of its own.
+
+    What is sent at step t arrives at step t + latency, and at no other. The anchor is the sender's position when it
+    sent, relative to the receiver on arrival, in communication radii. A sender farther away than the radius is not
+    heard, nor one whose message has not arrived: its wire is zeros.
+
+    senders  shape of the senders, (b,) or, where each receiver hears n of them, (b, n)
+    width    floats of the content
+    radius   metres
+    latency  control steps
+    corrupt  what happens to the wires (..., 2 + width) of one step on their way
+    """
+
+    def __init__(
+        self,
+        senders: tuple[int, ...],
+        width: int,
+        radius: float,
+        latency: int = LATENCY,
+        corrupt: Callable[[Tensor], Tensor] | None = None,
+    ):
+        self.latency, self.senders = latency, senders[0]
+        self._radius, self._corrupt = radius, corrupt
+        slots = latency + 1  # as many steps are in flight at once; a step's slot is its remainder
+        self._content = torch.zeros(slots, *senders, width)
+        self._sender = np.zeros((slots, *senders, 2))
+        self._sent_at = np.full((slots, senders[0]), NEVER)
+
+    def send(
+        self,
+        step: int | Int[np.ndarray, " b"],
+        content: Float[Tensor, "b *n c"],
+        sender: Float[np.ndarray, "b *n 2"],
+        rows: Int[np.ndarray, " b"] | None = None,
+    ) -> None:
+        """Sends contents at a step, each row at its own if need be, in place of what was sent at that step before.
+
+        rows  the rows that send, all by default
+        """
+        slot, rows = self._slots(step, rows)
+        self._content[slot, rows], self._sender[slot, rows], self._sent_at[slot, rows] = content, sender, step
+
+    def receive(
+        self,
+        step: int | Int[np.ndarray, " b"],
+        receiver: Float[np.ndarray, "b 2"],
+        rows: Int[np.ndarray, " b"] | None = None,
+    ) -> Float[Tensor, "b *n w"]:
+        """The wires as they reach receivers at their positions at a step."""
+        sent_at = step - self.latency
+        slot, rows = self._slots(sent_at, rows)
+        sender = self._sender[slot, rows]  # (b, *n, 2)
+        others = (1,) * (sender.ndim - 2)
+        offset = anchor(sender, receiver.reshape(len(receiver), *others, 2), self._radius)
+        wire = torch.cat([offset, self._content[slot, rows]], dim=-1)
+        if self._corrupt:
+            wire = self._corrupt(wire.flatten(0, -2)).reshape(wire.shape)
+        arrived = torch.from_numpy(self._sent_at[slot, rows] == sent_at).reshape(-1, *others, 1)
+        return wire * (arrived & heard(offset)[..., None])
+
+    def _slots(self, step, rows) -> tuple[np.ndarray, np.ndarray]:
+        rows = np.arange(self._sent_at.shape[1]) if rows is None else rows
+        return np.zeros_like(rows) + step % (self.latency + 1), rows
+
+
+def anchor(
+    sender: Float[np.ndarray, "b *n 2"], receiver: Float[np.ndarray, "b *m 2"], radius: float
+) -> Float[Tensor, "b *n 2"]:
     """The sender's position relative to the receiver, in communication radii."""
     return torch.from_numpy((sender - receiver) / radius).float()
 
 
-def deliver(
-    content: Float[Tensor, "b c"],
-    sender: Float[np.ndarray, "b 2"],
-    receiver: Float[np.ndarray, "b 2"],
-    radius: float,
-) -> Float[Tensor, "b w"]:
-    """The wire (b, 2 + c) as it reaches the receiver; all zeros from a sender farther away than `radius` metres."""
-    offset = anchor(sender, receiver, radius)
-    in_range = offset.norm(dim=1, keepdim=True) <= 1
-    return torch.cat([offset, content], dim=1) * in_range
+def heard(anchor: Float[Tensor, "*b 2"]) -> Bool[Tensor, "*b"]:
+    """Whether the receiver is within the sender's communication radius."""
+    return anchor.norm(dim=-1) <= 1
+
+
+def measured_latency(latency: int) -> int:
+    """Control steps after which a channel of this latency shows an impulse, sent at one step amid silence.
+
+    Raises ValueError if it shows at any other step than one.
+    """
+    steps, impulse, here = 2 * latency + 4, latency + 1, np.zeros((1, 2))
+    channel, shown = Channel((1,), 1, 1.0, latency), []
+    for step in range(steps):
+        channel.send(step, torch.full((1, 1), float(step == impulse)), here)
+        shown.append(channel.receive(step, here)[0, -1].item())
+    (seen,) = np.flatnonzero(shown)
+    return int(seen - impulse)
 
 
 def intact(wire: Float[Tensor, "b w"], rng: np.random.Generator) -> Float[Tensor, "b w"]:

@@ -1,8 +1,8 @@
 """The two-robot team as a PettingZoo environment: a navigator that chooses, a scout that sees, a channel between them.
 
-The scout's action is its message, of any content; the channel is the paper's (Section Broadcast and anchor), so that
-what it sends at one step reaches the navigator at the next, with the anchor of that step. Learners may train either
-robot or both: a frozen encoder as the scout's policy is the paper's own condition.
+The scout's action is its message, of any content; the channel is the paper's (Section Broadcast and anchor): what it
+sends reaches the navigator `latency` control steps later, one by default, with the anchor of its arrival. Learners may
+train either robot or both: a frozen encoder as the scout's policy is the paper's own condition.
 """
 
 from typing import Any, ClassVar
@@ -10,15 +10,16 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from pettingzoo import ParallelEnv
 
-from lt_lib.comm.channel import ANCHOR, deliver
+from lt_lib.comm.channel import ANCHOR, Channel
 from lt_lib.comm.messages import CONTENT
 from lt_lib.environments.gym import Scenes, frame_space, velocity_space
 from lt_lib.envs.arena import CONTROL_HZ
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.reference import TopView
+from lt_lib.settings.base import LATENCY, UserError
 
 NAVIGATOR, SCOUT = "navigator", "scout"
 
@@ -30,12 +31,16 @@ class TeamEnv(ParallelEnv):
                message arrives}; acts by a body-frame velocity in [-1, 1]^3
     scout      observes its own frame (64, 64, 3) uint8; acts by a message (content,) float32; it stands still
 
-    Raises UserError for an unknown layout, and for `render_mode="rgb_array"` where there is no OpenGL.
+    Raises UserError for an unknown layout, for a latency below 1, and for `render_mode="rgb_array"` without OpenGL.
     """
 
     metadata: ClassVar = {"name": "latent_telepathy_v0", "render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
 
-    def __init__(self, layout: str = "default", content: int = CONTENT, render_mode: str | None = None):
+    def __init__(
+        self, layout: str = "default", content: int = CONTENT, latency: int = LATENCY, render_mode: str | None = None
+    ):
+        if latency < 1:
+            raise UserError(f"latency: expected 1 or more control steps, since a message is an action, got {latency}")
         self._scenes, self._rng = Scenes(load_layout(layout), 1), np.random.default_rng()
         scene = self._scenes.arena.layout
         self.possible_agents, self.agents = [NAVIGATOR, SCOUT], []
@@ -45,7 +50,8 @@ class TeamEnv(ParallelEnv):
             SCOUT: frame_space(scene),
         }
         self.action_spaces = {NAVIGATOR: velocity_space(), SCOUT: Box(-np.inf, np.inf, (content,), np.float32)}
-        self._wire = np.zeros(wire.shape, np.float32)
+        self._wire, self._age = np.zeros(wire.shape, np.float32), 0
+        self._channel = lambda: Channel((1,), content, scene.communication_radius, latency)
         self.render_mode = render_mode
         self._view = TopView(scene) if render_mode else None
 
@@ -61,14 +67,17 @@ class TeamEnv(ParallelEnv):
             self._rng = np.random.default_rng(seed)
         self._scenes.restart(np.ones(1, bool), [self._rng])
         self.agents = list(self.possible_agents)
-        self._wire = np.zeros_like(self._wire)
+        self._wire, self._age, self._in_flight = np.zeros_like(self._wire), 0, self._channel()
         return self._observe(), self._each(self._scenes.info())
 
     def step(self, actions: dict[str, np.ndarray]):
         if not self.agents:
             return {}, {}, {}, {}, {}
+        arena, message = self._scenes.arena, torch.as_tensor(actions[SCOUT], dtype=torch.float32)
+        self._in_flight.send(self._age, message[None], arena.scout[:, :2])
         reward, terminated, truncated = self._scenes.step(actions[NAVIGATOR][None])
-        self._wire = self._delivered(np.asarray(actions[SCOUT], np.float32))
+        self._age += 1
+        self._wire = self._in_flight.receive(self._age, arena.pose[:, :2])[0].numpy()
         told = self._observe(), *map(self._each, (reward.item(), terminated.item(), truncated.item()))
         infos = self._each(self._scenes.info())
         if terminated or truncated:
@@ -77,12 +86,6 @@ class TeamEnv(ParallelEnv):
 
     def render(self) -> UInt8[np.ndarray, "h w 3"] | None:
         return self._scenes.seen_by(self._view) if self._view else None
-
-    def _delivered(self, message: Float[np.ndarray, " c"]) -> Float[np.ndarray, " w"]:
-        """The wire after this step: the message sent before it, the anchor after it."""
-        arena = self._scenes.arena
-        sent, radius = torch.from_numpy(message)[None], arena.layout.communication_radius
-        return deliver(sent, arena.scout[:, :2], arena.pose[:, :2], radius)[0].numpy()
 
     def _observe(self) -> dict[str, Any]:
         navigator = {"frame": self._scenes.navigator_frames()[0], "wire": self._wire}

@@ -7,12 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lt_lib.comm.channel import CORRUPTIONS
+from lt_lib.comm.channel import CORRUPTIONS, Channel
 from lt_lib.envs.layout import load_layout
 from lt_lib.gridworld.map import HORIZON, Grid
 from lt_lib.gridworld.mappo import Actor, Inputs
 from lt_lib.gridworld.patches import FrozenPatchEncoder
 from lt_lib.gridworld.walks import States, first_states
+from lt_lib.settings.base import LATENCY
 from lt_lib.settings.gridworld import GridEvaluationConfig
 
 Choice = Callable[[Float[Tensor, "n 5"], np.random.Generator], Int[np.ndarray, " n"]]
@@ -51,7 +52,7 @@ def evaluate_grid(
     for name, choose in CHOICES.items():
         rng = np.random.default_rng([seed, 9])
         starts = first_states(grid, config.episodes, rng)
-        cells = play(grid, inputs, actor, starts, config.wire, choose, rng)
+        cells = play(grid, inputs, actor, starts, config.wire, choose, rng, config.latency)
         arrived = grid.goal[cells]
         ended = arrived | grid.slab[starts.slab[:, None], cells]
         length = np.where(ended.any(1), ended.argmax(1), HORIZON)
@@ -66,21 +67,36 @@ def evaluate_grid(
 
 @torch.no_grad()
 def play(
-    grid: Grid, inputs: Inputs, actor: Actor, starts: States, wire: str, choose: Choice, rng: np.random.Generator
+    grid: Grid,
+    inputs: Inputs,
+    actor: Actor,
+    starts: States,
+    wire: str,
+    choose: Choice,
+    rng: np.random.Generator,
+    latency: int = LATENCY,
 ) -> Int[np.ndarray, "n t"]:
     """The navigator's cells, (n, 101); it stays where its episode ended.
 
     What is corrupted is corrupted alike throughout an episode, as the true message of a stationary scout is: one donor,
     one draw of the noise.
     """
-    cell, slab = starts.cell, torch.from_numpy(starts.slab)
+    cell, slab, message = starts.cell, torch.from_numpy(starts.slab), torch.from_numpy(starts.post + 1)
     seed, cells = int(rng.integers(2**32)), [starts.cell]
+    sent, scout = inputs.contents[message, slab], grid.centres[grid.posts[starts.post]]  # (n, c), (n, 2)
+    radius = grid.layout.communication_radius
+    channel = Channel(
+        (len(cell),),
+        sent.shape[1],
+        radius,
+        latency,
+        lambda wires: CORRUPTIONS[wire](wires, np.random.default_rng(seed)),
+    )
     for step in range(HORIZON):
-        message = torch.zeros_like(slab) if step == 0 else torch.from_numpy(starts.post + 1)
         where = torch.from_numpy(cell)
-        arrived = CORRUPTIONS[wire](inputs.wires(torch.stack([message, where, slab], 1)), np.random.default_rng(seed))
-        present = inputs.present[message, where]
-        wires = arrived * present[:, None]  # nothing can be corrupted before anything has arrived
+        channel.send(step, sent, scout)
+        wires = channel.receive(step, grid.centres[cell])  # (n, w)
+        present = inputs.present[message, where] & (step >= latency)
         action = choose(actor(inputs.own[where, slab], wires[:, None], present[:, None]), rng)
         ended = grid.goal[cell] | grid.slab[starts.slab, cell]
         cell = np.where(ended, cell, grid.following[cell, action])

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from lt_lib import ppo
+from lt_lib.comm.channel import heard
 from lt_lib.comm.receiver import Receiver
 from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.gridworld import table_ppo
@@ -65,7 +66,7 @@ class Critic(nn.Module):
 class Inputs(NamedTuple):
     """What the actor reads, by message, cell and placement of the slab.
 
-    Message 0 is the first step's, when none has arrived; message m is that of a scout at post m - 1.
+    Message 0 is none, before the first has arrived; message m is that of a scout at post m - 1.
     """
 
     own: Float[Tensor, "p slab 64"]
@@ -77,8 +78,7 @@ class Inputs(NamedTuple):
     def of(cls, grid: Grid, encoder: FrozenPatchEncoder, content: str) -> "Inputs":
         own = encoder.latent(grid.patches.reshape(-1, PATCH, PATCH)).reshape(len(grid.cells), len(SIDES), LATENT)
         where, sent = anchors(grid), contents_sent(grid, encoder, content)
-        in_range = where.norm(dim=-1) <= 1
-        return cls(own, *(torch.cat([torch.zeros_like(x[:1]), x]) for x in (where, sent, in_range)))
+        return cls(own, *(torch.cat([torch.zeros_like(x[:1]), x]) for x in (where, sent, heard(where))))
 
     def wires(self, observations: Int[Tensor, "b 3"]) -> Float[Tensor, "b w"]:
         message, cell, slab = observations.unbind(1)
@@ -151,7 +151,7 @@ def train_grid(
     for update in range(total):
         with torch.no_grad():
             log_probs, values = team.log_probs(), team.values()
-        walks, states = walk(grid, log_probs.exp().numpy(), states, config.rollout, rng)
+        walks, states = walk(grid, log_probs.exp().numpy(), states, config.rollout, rng, config.latency)
         rows, sampled = batch(log_probs, values, walks, config.ppo)
         statistics = table_ppo.update(team, optimiser, rows, sampled, config.ppo, config.minibatch, rng)
         success.append(walks.arrived[walks.ended])

@@ -9,7 +9,7 @@ from lt_lib.gridworld.mappo import train_grid
 from lt_lib.gridworld.patch_gates import measure_patch_gates, require_patch_gates
 from lt_lib.gridworld.patches import train_patch_encoder
 from lt_lib.gridworld.wires import GRID_CONTENTS
-from lt_lib.settings.base import require_known
+from lt_lib.settings.base import everywhere, require_known
 from lt_lib.settings.gridworld import (
     GridConfig,
     GridEvaluationConfig,
@@ -18,6 +18,7 @@ from lt_lib.settings.gridworld import (
     PatchGateConfig,
     PatchGates,
 )
+from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -38,14 +39,10 @@ class GridProtocol:
     @classmethod
     def of(cls, gridworld: Mapping, workers: int | str) -> "GridProtocol":
         """From a notebook's parameters."""
-        section = GridworldConfig(**gridworld)
-        there = {"layout": section.layout}
-        return cls(
-            RunStore(runs_folder(), workers),
-            section.encoder.model_copy(update=there),
-            section.gates,
-            section.policy.model_copy(update=there),
-        )
+        section = validated(GridworldConfig, "gridworld", dict(gridworld))
+        there = {"layout": section.layout, "latency": section.latency}
+        encoder, policy = (everywhere(each, there) for each in (section.encoder, section.policy))
+        return cls(RunStore(runs_folder(), workers), encoder, section.gates, policy)
 
     def encoders(self) -> dict[str, Result]:
         """Ours, the ablation of the auxiliary that the paper calls necessary, and what ours must beat at the gates."""
@@ -96,10 +93,11 @@ class GridProtocol:
         self, policies: Mapping[str, list[Result]], episodes: int, encoder: Result
     ) -> dict[str, list[dict[str, Result]]]:
         """Every frozen policy under every wire condition: {content: [{wire: result} a seed]}."""
+        shared = {"layout": self.grid.layout, "latency": self.grid.latency}
         runs = {
             (content, seed, wire): Run(
                 evaluate_grid,
-                GridEvaluationConfig(layout=self.grid.layout, content=content, wire=wire, episodes=episodes),
+                GridEvaluationConfig(content=content, wire=wire, episodes=episodes, **shared),
                 SEED,
                 {"policy": _actor_only(policy), "encoder": _frozen(encoder)},
             )

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from lt_lib.envs.compiled import compiled
 from lt_lib.envs.layout import SIDES
 from lt_lib.gridworld.map import GOAL_REWARD, HORIZON, MOVES, SLAB_REWARD, STEP_REWARD, Grid
+from lt_lib.settings.base import LATENCY
 
 DRAWS = 4  # uniform numbers a step: action, spawn, slab, post
 
@@ -20,10 +21,9 @@ class States(NamedTuple):
     post: Int[np.ndarray, " n"]
     clock: Int[np.ndarray, " n"]
 
-    @property
-    def message(self) -> Int[np.ndarray, " n"]:
+    def message(self, latency: int) -> Int[np.ndarray, " n"]:
         """0 before the first message has arrived, then one more than the scout's post."""
-        return np.where(self.clock == 0, 0, self.post + 1)
+        return np.where(self.clock < latency, 0, self.post + 1)
 
 
 class Walks(NamedTuple):
@@ -49,7 +49,12 @@ def first_states(grid: Grid, n: int, rng: np.random.Generator) -> States:
 
 
 def walk(
-    grid: Grid, probs: Float[np.ndarray, "m p 2 a"], states: States, steps: int, rng: np.random.Generator
+    grid: Grid,
+    probs: Float[np.ndarray, "m p 2 a"],
+    states: States,
+    steps: int,
+    rng: np.random.Generator,
+    latency: int = LATENCY,
 ) -> tuple[Walks, States]:
     """Samples actions from a table over (message, cell, slab) for some steps; ended episodes start anew."""
     uniform = rng.random((steps, len(states.cell), DRAWS))
@@ -60,6 +65,7 @@ def walk(
         grid.goal,
         grid.spawn,
         len(grid.posts),
+        latency,
         np.stack(states),
         uniform,
     )
@@ -73,13 +79,13 @@ def walk(
 
 
 @compiled()
-def _walk(cumulative, following, slab_cells, goal, spawn, posts, states, uniform):
+def _walk(cumulative, following, slab_cells, goal, spawn, posts, latency, states, uniform):
     steps, n = uniform.shape[:2]
     out, states = np.empty((6, steps, n), np.int64), states.copy()
     for i in range(n):
         cell, slab, post, clock = states[:, i]
         for t in range(steps):
-            message = 0 if clock == 0 else post + 1
+            message = 0 if clock < latency else post + 1
             action = 0
             while action < len(MOVES) - 1 and uniform[t, i, 0] >= cumulative[message, cell, slab, action]:
                 action += 1

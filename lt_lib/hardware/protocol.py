@@ -17,7 +17,7 @@ from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.gates import encode
 from lt_lib.pixels.executor import ROUTES, FrozenExecutor, train_executor
-from lt_lib.settings.base import ROOT
+from lt_lib.settings.base import ROOT, everywhere
 from lt_lib.settings.devices import computing_device
 from lt_lib.settings.hardware import (
     HardwareGates,
@@ -28,6 +28,7 @@ from lt_lib.settings.hardware import (
     SweepConfig,
 )
 from lt_lib.settings.pixels import ExecutorConfig
+from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -66,12 +67,13 @@ class HardwareProtocol:
             "rails": RailsConfig,
         }
         shared = {"device": computing_device(device), "layout": "matched"}
-        configs = {name: kinds[name](**shared, **sections.pop(name)) for name in kinds}
+        given = {name: validated(kind, name, sections[name]) for name, kind in kinds.items()}
+        configs = {name: everywhere(each, shared) for name, each in given.items()}
         return cls(
             RunStore(runs_folder(), workers),
             gates,
             **configs,
-            sessions=SessionsConfig(**sections["sessions"]),
+            sessions=validated(SessionsConfig, "sessions", sections["sessions"]),
             simulated=simulated,
             folder=ROOT / frames if frames else None,
         )

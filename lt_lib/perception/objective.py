@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lt_lib.perception.encoder import LATENT, Predictor
-from lt_lib.settings.perception import EncoderConfig
+from lt_lib.settings.perception import ObjectiveConfig
 
 
 class Losses(NamedTuple):
@@ -91,7 +91,7 @@ def fit(
     model: Jepa,
     losses: Callable[[Int[np.ndarray, " b"], Int[np.ndarray, " b"]], Losses],
     rollouts: tuple[int, int],
-    config: EncoderConfig,
+    config: ObjectiveConfig,
     rng: np.random.Generator,
     report: Callable[[float], None],
 ) -> dict[str, np.ndarray]:

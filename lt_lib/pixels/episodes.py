@@ -5,7 +5,7 @@ commanded route, is therefore the same for every content, and is simulated once.
 """
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -65,42 +65,63 @@ def drive(
 
     A batch always has `envs` rows, so that an episode's arithmetic does not depend on what runs beside it.
     """
-    total = len(slab)
     arena, camera = Arena(layout, envs), FastCamera(layout)
-    episode = np.arange(envs) % total  # which episode a row plays; rows to spare replay one and are not recorded
-    following, finished = min(envs, total), 0
-    live, age = np.arange(envs) < total, np.zeros(envs, np.int64)
-    outcome = Outcomes(
-        np.zeros(total, bool),
-        np.zeros(total, np.int64),
-        np.zeros(total, np.int64),
-        np.full(total, NO_CORRIDOR),
-    )
+    seats, outcome = Seats(envs, len(slab)), none_yet(len(slab))
+    episode = seats.episode  # rows to spare replay one and are not recorded
     arena.reset(np.ones(envs, bool), draws.spawn[episode], slab[episode], draws.scout[episode])
-    while finished < total:
+    while seats.live.any():
         latent = encoder.latent(camera.frames(arena.pose, arena.slab, arena.scout[:, :2]))
-        action = executor.mean_action(latent, route[episode])
-        arena.step(np.where(age[:, None] < commit_step, 0.0, action), live)
-        age += 1
-        _record(outcome, episode[live], arena, live)
-        ended = live & (arena.reached | (age >= HORIZON))
+        action = executor.mean_action(latent, route[seats.episode])
+        arena.step(np.where(seats.age[:, None] < commit_step, 0.0, action), seats.live)
+        seats.age += 1
+        record(outcome, arena, seats)
+        ended = seats.live & (arena.reached | (seats.age >= HORIZON))
         if ended.any():
-            outcome.success[episode[ended]], outcome.length[episode[ended]] = arena.reached[ended], age[ended]
-            finished += ended.sum()
-            rows = np.flatnonzero(ended)[: total - following]
-            live[ended] = False
-            live[rows] = True
-            episode[rows] = following + np.arange(len(rows))
-            following, age[rows] = following + len(rows), 0
-            arena.reset(ended & live, draws.spawn[episode], slab[episode], draws.scout[episode])
-            report(finished / total)
+            fresh, episode = seats.pass_on(ended), seats.episode
+            arena.reset(fresh, draws.spawn[episode], slab[episode], draws.scout[episode])
+            report(seats.finished / len(slab))
     return outcome
 
 
-def _record(outcome: Outcomes, episode, arena: Arena, live):
-    outcome.contacts[episode] += arena.contact[live]
+class Seats:
+    """Which episode each row plays: a row whose episode has ended takes the next one that waits."""
+
+    def __init__(self, rows: int, episodes: int):
+        self.episode = np.arange(rows) % episodes
+        self.live = np.arange(rows) < episodes
+        self.age = np.zeros(rows, np.int64)  # control steps
+        self.finished, self._following, self._episodes = 0, min(rows, episodes), episodes
+
+    def pass_on(self, ended: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Seats the next episodes where some have ended; returns the rows with a new one."""
+        self.finished += ended.sum()
+        rows = np.flatnonzero(ended)[: self._episodes - self._following]
+        self.live[ended] = False
+        self.live[rows] = True
+        self.episode[rows], self.age[rows] = self._following + np.arange(len(rows)), 0
+        self._following += len(rows)
+        return ended & self.live
+
+
+def none_yet(episodes: int) -> Outcomes:
+    """Outcomes of episodes in which nothing has happened yet."""
+    success, length, contacts = np.zeros(episodes, bool), *np.zeros((2, episodes), np.int64)
+    return Outcomes(success, length, contacts, np.full(episodes, NO_CORRIDOR))
+
+
+def record(outcome: Outcomes, arena: Arena, seats: Seats) -> None:
+    """Notes what the latest step did to the episodes that are live."""
+    episode = seats.episode[seats.live]
+    outcome.success[episode] = arena.reached[seats.live]
+    outcome.length[episode] = seats.age[seats.live]
+    outcome.contacts[episode] += arena.contact[seats.live]
     first = outcome.entered[episode] == NO_CORRIDOR
-    outcome.entered[episode[first]] = arena.corridor[live][first]
+    outcome.entered[episode[first]] = arena.corridor[seats.live][first]
+
+
+def held_out_draws(bank: Mapping[str, Any]) -> int:
+    """How many of a bank's draws, its first ones, are kept for evaluation."""
+    return int(len(bank["spawn"]) * bank["held_out"])
 
 
 def roll_bank(
@@ -111,7 +132,10 @@ def roll_bank(
     encoder: Mapping[str, np.ndarray],
     executor: Mapping[str, np.ndarray],
 ) -> dict:
-    """Every outcome of `entries` draws of the scene: arrays (entries, slab, route), and the draws (entries, 3)."""
+    """Every outcome of `entries` draws of the scene: arrays (entries, slab, route), and the draws (entries, 3).
+
+    "commit_step" and "held_out" are the bank's, for whatever trains or evaluates on its scenes.
+    """
     layout, device = load_layout(config.layout), config.device
     draws = draw_scenes(layout, config.entries, np.random.default_rng([seed, 2]))
     shape = (config.entries, SLABS, ROUTES)
@@ -127,4 +151,5 @@ def roll_bank(
         config.commit_step,
         report,
     )
-    return draws._asdict() | {name: values.reshape(shape) for name, values in outcome._asdict().items()}
+    shaped = {name: values.reshape(shape) for name, values in outcome._asdict().items()}
+    return draws._asdict() | shaped | {"commit_step": config.commit_step, "held_out": config.held_out}

@@ -6,6 +6,7 @@ Everything but the message is held fixed: one frozen encoder, one frozen executo
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,13 +18,12 @@ from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import facts_of, load_frozen, save_frozen
 from lt_lib.pixels.episodes import ROUTES, roll_bank
 from lt_lib.pixels.executor import train_executor
-from lt_lib.pixels.redraw import REDRAWS, train_redrawn_head
+from lt_lib.pixels.redraw import REDRAWS, SCENES, train_redrawn_head
 from lt_lib.pixels.route import evaluate_head, train_head
-from lt_lib.settings.base import ROOT, Training, require_known
+from lt_lib.settings.base import ROOT, everywhere, require_known
 from lt_lib.settings.devices import computing_device
-from lt_lib.settings.perception import EncoderConfig, GateConfig, Gates
-from lt_lib.settings.pixels import BankConfig, EvaluationConfig, ExecutorConfig, HeadConfig, RedrawConfig
-from lt_lib.settings.profiles import SECTIONS
+from lt_lib.settings.pixels import EvaluationConfig, HeadConfig, PixelsConfig, RedrawConfig
+from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -32,44 +32,34 @@ SEED = 0  # of the one encoder and the one executor, as in the paper; heads have
 
 
 @dataclass(frozen=True)
-class Protocol:
+class PixelProtocol:
     """The stages at one size.
 
     weights  a folder of frozen encoder and executor to use, or None: train them
-    shards   how many runs the episode bank is split into
     """
 
     store: RunStore
-    encoder: EncoderConfig = EncoderConfig()
-    probe: GateConfig = GateConfig()
-    gates: Gates = Gates()
-    executor: ExecutorConfig = ExecutorConfig()
-    bank: BankConfig = BankConfig()
-    head: HeadConfig = HeadConfig()
-    redraw: RedrawConfig = RedrawConfig()
-    shards: int = 8
+    sizes: PixelsConfig
+    layout: str
     weights: Path | None = None
 
     @classmethod
     def of(
-        cls, layout: str, device: str, workers: int | str, weights: str = "", shards: int = 8, **sections: Mapping
-    ) -> "Protocol":
-        """From a notebook's parameters: `sections` are the dicts named as in `settings.profiles.SECTIONS`."""
-        shared = {"layout": layout, "device": computing_device(device)}
-        configs = {
-            name: SECTIONS[name](**(shared if issubclass(SECTIONS[name], Training) else {}), **values)
-            for name, values in sections.items()
-        }
-        folder = ROOT / weights if weights else None
-        return cls(RunStore(runs_folder(), workers), shards=shards, weights=folder, **configs)
+        cls, pixels: Mapping[str, Any], layout: str, device: str, workers: int | str, weights: str = ""
+    ) -> "PixelProtocol":
+        """From a notebook's parameters. Raises UserError for those that cannot be used."""
+        sizes = validated(PixelsConfig, "pixels", pixels)
+        shared = {"layout": layout, "device": computing_device(device), "latency": sizes.latency}
+        sizes = sizes.model_copy(update={name: everywhere(each, shared) for name, each in sizes})
+        return cls(RunStore(runs_folder(), workers), sizes, layout, ROOT / weights if weights else None)
 
     def encoders(self) -> dict[str, Result]:
         """Ours, and what it must beat at the gates: an untrained one, and one trained by prediction alone."""
         alone = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
         configs = {
-            "ours": self.encoder,
-            "untrained": self.encoder.model_copy(update={"epochs": 0.0}),
-            "prediction alone": self.encoder.model_copy(update=alone),
+            "ours": self.sizes.encoder,
+            "untrained": self.sizes.encoder.model_copy(update={"epochs": 0.0}),
+            "prediction alone": self.sizes.encoder.model_copy(update=alone),
         }
         if self.weights:
             del configs["ours"]
@@ -79,7 +69,7 @@ class Protocol:
 
     def gate_reports(self, encoders: Mapping[str, Result]) -> dict[str, Result]:
         """Probes and rank of checkpoints; see `perception.gates.Measured`."""
-        runs = [Run(measure_gates, self.probe, SEED, {"encoder": encoder}) for encoder in encoders.values()]
+        runs = [Run(measure_gates, self.sizes.probe, SEED, {"encoder": encoder}) for encoder in encoders.values()]
         return dict(zip(encoders, self.store.fetch(runs, "freeze gates"), strict=True))
 
     def frozen_encoder(self) -> Result:
@@ -87,38 +77,39 @@ class Protocol:
         trained = (
             self._kept("encoder")
             if self.weights
-            else self.store.fetch([Run(train_encoder, self.encoder, SEED)], "encoder")[0]
+            else self.store.fetch([Run(train_encoder, self.sizes.encoder, SEED)], "encoder")[0]
         )
-        require_gates(self.gate_reports({"ours": trained})["ours"], self.gates)
+        require_gates(self.gate_reports({"ours": trained})["ours"], self.sizes.gates)
         return trained
 
     def _kept(self, kind: str) -> Result:
-        return load_frozen(self.weights, kind, load_layout(self.encoder.layout))
+        return load_frozen(self.weights, kind, load_layout(self.layout))
 
     def frozen_executor(self, encoder: Result) -> Result:
         """The low-level controller, pretrained behind the frozen encoder."""
         if self.weights:
             return self._kept("executor")
-        return self.store.fetch([Run(train_executor, self.executor, SEED, {"encoder": encoder})], "executor")[0]
+        return self.store.fetch([Run(train_executor, self.sizes.executor, SEED, {"encoder": encoder})], "executor")[0]
 
     def encoder_facts(self, report: Result) -> dict:
         """What goes with the frozen encoder: the settings it was trained with and what it showed at the gates."""
         if self.weights:
             return facts_of(self.weights, "encoder")
-        return {"settings": self.encoder.model_dump(), "gates": {name: report[name] for name in Measured._fields}}
+        return {"settings": self.sizes.encoder.model_dump(), "gates": {name: report[name] for name in Measured._fields}}
 
     def save_executor(self, executor: Result, folder: Path) -> Path:
         """Keeps the frozen executor beside the frozen encoder."""
-        facts = facts_of(self.weights, "executor") if self.weights else {"settings": self.executor.model_dump()}
-        return save_frozen(folder, "executor", executor, load_layout(self.executor.layout), facts)
+        facts = facts_of(self.weights, "executor") if self.weights else {"settings": self.sizes.executor.model_dump()}
+        return save_frozen(folder, "executor", executor, load_layout(self.layout), facts)
 
     def episode_bank(self, encoder: Result, executor: Result) -> Result:
         """Every outcome of `shards` times `bank.entries` draws of the scene; arrays (entries, slab, route)."""
         inputs = {"encoder": encoder, "executor": executor}
         shards = self.store.fetch(
-            [Run(roll_bank, self.bank, shard, inputs) for shard in range(self.shards)], "episode bank"
+            [Run(roll_bank, self.sizes.bank, shard, inputs) for shard in range(self.sizes.shards)], "episode bank"
         )
-        return {name: np.concatenate([shard[name] for shard in shards]) for name in shards[0]}
+        arrays = [name for name, value in shards[0].items() if isinstance(value, np.ndarray)]
+        return shards[0] | {name: np.concatenate([shard[name] for shard in shards]) for name in arrays}
 
     def trained_heads(self, seeds: Mapping[str, int], bank: Result, encoder: Result) -> dict[str, list[Result]]:
         """Stage 2: so many seeds of each condition of Table I, all with the same settings.
@@ -141,7 +132,7 @@ class Protocol:
         no bonus   the latent drawn at every step, without the entropy bonus that all rows share
         float32    two batches with one draw an episode: the bank's, episode by episode
         """
-        scenes = {name: bank[name] for name in ("spawn", "scout")}
+        scenes = {name: bank[name] for name in SCENES}
         inputs = {"scenes": scenes, "encoder": encoder, "executor": executor}
         rows = {(name, seed): self._redrawn(name) for name in seeds if name in REDRAWS for seed in range(seeds[name])}
         every, once = self._redrawn("k1"), self._redrawn("k0")
@@ -164,22 +155,20 @@ class Protocol:
     def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
         """A frozen trained head under every wire condition of Table IV, greedily."""
         inputs = {"head": _weights_only(head), "bank": bank, "encoder": encoder}
-        content = CONDITIONS[name].content
-        configs = [
-            EvaluationConfig(content=content, wire=wire, layout=self.head.layout, episodes=episodes)
-            for wire in CORRUPTIONS
-        ]
+        shared = {key: getattr(self.sizes.head, key) for key in ("layout", "device", "latency")}
+        shared |= {"content": CONDITIONS[name].content, "episodes": episodes}
+        configs = [EvaluationConfig(wire=wire, **shared) for wire in CORRUPTIONS]
         runs = [Run(evaluate_head, config, SEED, inputs) for config in configs]
         return dict(zip(CORRUPTIONS, self.store.fetch(runs, f"corruption of {name}"), strict=True))
 
     def _head(self, name: str) -> HeadConfig:
         require_known([name], CONDITIONS, "message condition")
         condition = CONDITIONS[name]
-        return self.head.model_copy(update={"content": condition.content, "wire": condition.wire})
+        return self.sizes.head.model_copy(update={"content": condition.content, "wire": condition.wire})
 
     def _redrawn(self, name: str) -> RedrawConfig:
         row = REDRAWS[name]
-        return self.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
+        return self.sizes.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
 
 
 def _weights_only(head: Result) -> Result:

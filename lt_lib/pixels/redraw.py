@@ -14,15 +14,25 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lt_lib import ppo
-from lt_lib.comm.channel import ANCHOR, deliver
+from lt_lib.comm.channel import ANCHOR, Channel
 from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
-from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena
+from lt_lib.envs.arena import HORIZON, Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import load_layout
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.renewal import renew
-from lt_lib.pixels.episodes import ARRIVAL_REWARD, CONTACT_REWARD, SLABS, Draws, Outcomes
+from lt_lib.pixels.episodes import (
+    ARRIVAL_REWARD,
+    CONTACT_REWARD,
+    SLABS,
+    Draws,
+    Outcomes,
+    Seats,
+    held_out_draws,
+    none_yet,
+    record,
+)
 from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.settings.pixels import RedrawConfig
 from lt_lib.settings.ppo import PpoConfig
@@ -46,7 +56,9 @@ REDRAWS = {
     "k30_gae": Redraw("latent", 30, "gae", "ours", "every 30 steps, discounted credit"),
     "k1_gae": Redraw("latent", 1, "gae", "ours", "every step, discounted credit"),
 }
-BLOCK = 16  # frames are encoded in multiples of this, so that a row's arithmetic does not depend on its neighbours'
+SCENES = ("spawn", "scout", "commit_step", "held_out")  # what of an episode bank the live training needs
+# Frames are encoded in multiples of this, so that a row's arithmetic does not depend on its neighbours'
+FRAMES_AT_ONCE = 16
 UNSEEN = 255  # no palette index
 
 
@@ -70,12 +82,15 @@ class FrameMemory:
         self._frames.view(np.uint8)[which] = UNSEEN
 
     def recall(self, rows: Int[np.ndarray, " b"], frames, make: Callable) -> Float[Tensor, "b width"]:
-        """What was made of the frames (B, H, W) of some rows; `make` takes positions in `rows`, BLOCK or a multiple."""
+        """What was made of the frames (B, H, W) of some rows.
+
+        make  takes positions in `rows`, a multiple of FRAMES_AT_ONCE
+        """
         changed = np.empty(len(rows), bool)
         renew(self._frames, rows, frames.reshape(len(rows), -1).view(np.uint64), changed)
         new = np.flatnonzero(changed)
         if len(new):
-            whole_blocks = np.resize(new, -(-len(new) // BLOCK) * BLOCK)
+            whole_blocks = np.resize(new, -(-len(new) // FRAMES_AT_ONCE) * FRAMES_AT_ONCE)
             made = make(whole_blocks)
             if self.made is None:
                 self.made = made.new_zeros(len(self._frames), made.shape[1])
@@ -83,31 +98,20 @@ class FrameMemory:
         return self.made[rows]
 
 
-class Seats:
-    """Which episode each row plays: a row whose episode has ended takes the next one that waits."""
-
-    def __init__(self, rows: int, episodes: int):
-        self.episode = np.arange(rows) % episodes
-        self.live = np.arange(rows) < episodes
-        self.age = np.zeros(rows, np.int64)  # control steps
-        self._following, self._episodes = min(rows, episodes), episodes
-
-    def pass_on(self, ended: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Seats the next episodes where some have ended; returns the rows with a new one."""
-        rows = np.flatnonzero(ended)[: self._episodes - self._following]
-        self.live[ended] = False
-        self.live[rows] = True
-        self.episode[rows], self.age[rows] = self._following + np.arange(len(rows)), 0
-        self._following += len(rows)
-        return ended & self.live
-
-
 class LiveArena:
     """Navigators that the frozen executor drives, and the scouts' messages to them, `config.envs` side by side."""
 
-    def __init__(self, config: RedrawConfig, encoder: Mapping[str, np.ndarray], executor: Mapping[str, np.ndarray]):
+    def __init__(
+        self,
+        config: RedrawConfig,
+        commit_step: int,
+        encoder: Mapping[str, np.ndarray],
+        executor: Mapping[str, np.ndarray],
+    ):
         device = config.device
-        self._layout, self._config = load_layout(config.layout), config
+        self._layout, self._config, self._commit_step = load_layout(config.layout), config, commit_step
+        radius = self._layout.communication_radius
+        self._channel = Channel((config.envs,), CONTENT, radius, config.latency)
         self._arena, self._camera = Arena(self._layout, config.envs), FastCamera(self._layout)
         self._encoder = FrozenEncoder(encoder, device, config.precision)
         self._executor = FrozenExecutor(executor, device)
@@ -122,40 +126,39 @@ class LiveArena:
                 They come with the episode, so that it does not matter which row plays it, and when.
         """
         arena, seats = self._arena, Seats(self._config.envs, len(slab))
-        outcome, log = _none_yet(len(slab)), []
+        outcome, log = none_yet(len(slab)), []
         rewards = np.zeros_like(chance)
         route = np.zeros(arena.n, np.int64)
         self._start(np.ones(arena.n, bool), draws, slab, seats)
-        before = arena.pose
         while seats.live.any():
-            number = self._draw_number(seats.age)
-            rows = np.flatnonzero(seats.live & self._draws_now(seats.age))
+            number = self._draw_number(seats.age)  # (n,)
+            # a scout's message is computed only if the route is drawn when it arrives
+            self._send(np.flatnonzero(seats.live & self._draws_at(seats.age + self._channel.latency)), seats.age)
+            rows = np.flatnonzero(seats.live & self._draws_at(seats.age))  # (b,)
             if len(rows):
-                wire = self._wires(rows, before)
+                wire = self._channel.receive(seats.age[rows], arena.pose[rows, :2], rows)  # (b, w)
                 at = seats.episode[rows], number[rows]
                 route[rows] = chance[at] < head.policy(wire).probs[:, 1].numpy()
                 log.append((seats.episode[rows], wire, route[rows]))
-            before = arena.pose
-            action = self._action(seats.live, route)
-            arena.step(np.where(seats.age[:, None] < self._config.commit_step, 0.0, action), seats.live)
+            action = self._action(seats.live, route)  # (n, 3)
+            arena.step(np.where(seats.age[:, None] < self._commit_step, 0.0, action), seats.live)
             seats.age += 1
             live, at = seats.live, (seats.episode[seats.live], number[seats.live])
             rewards[at] += ARRIVAL_REWARD * arena.reached[live] + CONTACT_REWARD * arena.contact[live]
-            _record(outcome, arena, seats)
+            record(outcome, arena, seats)
             ended = live & (arena.reached | (seats.age >= HORIZON))
             if ended.any():
                 self._start(seats.pass_on(ended), draws, slab, seats)
-                before = np.where(seats.age[:, None] == 0, arena.pose, before)
         return outcome, _ordered(log, rewards)
 
-    def _draws_now(self, age) -> Bool[np.ndarray, " n"]:
-        every, since = self._config.every, age - self._config.commit_step
+    def _draws_at(self, age: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        every, since = self._config.every, age - self._commit_step
         return (since == 0) | ((since > 0) & (since % every == 0) if every else False)
 
     def _draw_number(self, age) -> Int[np.ndarray, " n"]:
         """Which draw of its episode a row lives by, 0 before the first."""
         every = self._config.every or HORIZON
-        return np.maximum(age - self._config.commit_step, 0) // every
+        return np.maximum(age - self._commit_step, 0) // every
 
     def _start(self, which: Bool[np.ndarray, " n"], draws: Draws, slab, seats: Seats):
         self._arena.reset(which, draws.spawn[seats.episode], slab[seats.episode], draws.scout[seats.episode])
@@ -167,41 +170,24 @@ class LiveArena:
         self._own.recall(rows, frames, lambda picks: self._encoder.latent(frames[picks]))
         return self._executor.mean_action(self._own.made, route)
 
-    def _wires(self, rows: Int[np.ndarray, " b"], before: Float[np.ndarray, "n 3"]) -> Float[Tensor, "b w"]:
-        """What has reached the navigators of some rows: sent a step ago, when they stood at `before`."""
+    def _send(self, rows: Int[np.ndarray, " b"], age: Int[np.ndarray, " n"]) -> None:
+        """The scouts of some rows send what they see."""
+        if not len(rows):
+            return
         scout, slab = self._arena.scout[rows], self._arena.slab[rows]
-        frames = self._camera.frames(scout, slab, before[rows, :2])
+        frames = self._camera.frames(scout, slab, self._arena.pose[rows, :2])
         still = np.zeros((len(rows), 2))
         content = CONTENTS[self._config.content]
 
         def sent(picks):
             return content(Sender(self._layout, self._encoder, frames[picks], scout[picks], still[picks], slab[picks]))
 
-        return deliver(
-            self._sent.recall(rows, frames, sent),
-            scout[:, :2],
-            self._arena.pose[rows, :2],
-            self._layout.communication_radius,
-        )
+        self._channel.send(age[rows], self._sent.recall(rows, frames, sent), scout[:, :2], rows)
 
 
-def draws_an_episode(config: RedrawConfig) -> int:
+def draws_per_episode(every: int, commit_step: int) -> int:
     """How many routes are drawn in an episode that lasts to the time-out."""
-    return -(-(HORIZON - config.commit_step) // config.every) if config.every else 1
-
-
-def _none_yet(episodes: int) -> Outcomes:
-    success, length, contacts = np.zeros(episodes, bool), *np.zeros((2, episodes), np.int64)
-    return Outcomes(success, length, contacts, np.full(episodes, NO_CORRIDOR))
-
-
-def _record(outcome: Outcomes, arena: Arena, seats: Seats):
-    episode = seats.episode[seats.live]
-    outcome.success[episode] = arena.reached[seats.live]
-    outcome.length[episode] = seats.age[seats.live]
-    outcome.contacts[episode] += arena.contact[seats.live]
-    first = outcome.entered[episode] == NO_CORRIDOR
-    outcome.entered[episode[first]] = arena.corridor[seats.live][first]
+    return -(-(HORIZON - commit_step) // every) if every else 1
 
 
 def _ordered(log: list, rewards: Float[np.ndarray, "e d"]) -> Decisions:
@@ -247,7 +233,7 @@ def train_redrawn_head(
     encoder: Mapping[str, np.ndarray],
     executor: Mapping[str, np.ndarray],
 ) -> dict:
-    """Trains one head live on the training draws of the scene in `scenes` ("spawn", "scout"); any content but raw.
+    """Trains one head live on the training draws of the bank's `scenes` (`SCENES`); any content but raw.
 
     "head.*"           weights
     "optimal", "entered", "success", "contacts", "length" (episodes,) of the head's sampled choices, in order;
@@ -255,8 +241,9 @@ def train_redrawn_head(
     "entropy", "draws" (updates,) nats a draw, draws in the batch
     """
     rng = np.random.default_rng([seed, 3])  # the scenes and the chance of `train_head` of this seed
-    arena = LiveArena(config, encoder, executor)
-    spawn, scout = (scenes[name][int(len(scenes[name]) * config.held_out) :] for name in ("spawn", "scout"))
+    commit_step = scenes["commit_step"]
+    arena = LiveArena(config, commit_step, encoder, executor)
+    spawn, scout = (scenes[name][held_out_draws(scenes) :] for name in ("spawn", "scout"))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         head = RouteHead(ANCHOR + CONTENT)
@@ -265,7 +252,7 @@ def train_redrawn_head(
     for start in range(0, config.episodes, config.batch):
         n = min(config.batch, config.episodes - start)
         entry, slab = rng.integers(0, len(spawn), n), rng.integers(0, SLABS, n)
-        chance = rng.random((n, draws_an_episode(config)))
+        chance = rng.random((n, draws_per_episode(config.every, commit_step)))
         outcome, decisions = arena.play(head, Draws(spawn[entry], scout[entry]), slab, chance)
         entropy = _improve(head, optimiser, outcome, decisions, config, rng)
         episodes.append({"optimal": outcome.entered == 1 - slab} | outcome._asdict())

@@ -13,37 +13,62 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lt_lib import ppo
-from lt_lib.comm.channel import CORRUPTIONS, deliver
+from lt_lib.comm.channel import ANCHOR, CORRUPTIONS, Channel
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
-from lt_lib.pixels.episodes import SLABS, Outcomes
+from lt_lib.pixels.episodes import SLABS, Outcomes, held_out_draws
 from lt_lib.settings.pixels import EvaluationConfig, HeadConfig
 
 CHUNK = 1024  # frames encoded at a time
 
 
 class Bank(NamedTuple):
-    """The wire and the outcome of every draw of the scene: wires (E, slab, W), outcomes (E, slab, route)."""
+    """The content and the outcome of every draw of the scene, and where the robots stand in it (metres)."""
 
-    wires: Float[Tensor, "e slab w"]
-    outcomes: Outcomes
+    contents: Float[Tensor, "e slab c"]
+    scout: Float[np.ndarray, "e 2"]
+    navigator: Float[np.ndarray, "e 2"]  # at the commit step, until which it waits at its spawn
+    outcomes: Outcomes  # (E, slab, route)
+    commit_step: int
 
     def take(self, entries: slice) -> "Bank":
-        return Bank(self.wires[entries], Outcomes(*(values[entries] for values in self.outcomes)))
+        kept = (values[entries] for values in self[:3])
+        return Bank(*kept, Outcomes(*(values[entries] for values in self.outcomes)), self.commit_step)
+
+    def wires(
+        self, channel: Channel, entry: Int[np.ndarray, " b"], slab: Int[np.ndarray, " b"]
+    ) -> Float[Tensor, "b w"]:
+        """What reaches the navigators of some draws, under either placement, at the commit step."""
+        sent = self.contents[entry, slab], self.scout[entry]
+        return committed_wires(channel, self.commit_step, *sent, self.navigator[entry])
 
 
-def sent_wires(
+def committed_wires(
+    channel: Channel,
+    commit_step: int,
+    content: Float[Tensor, "b c"],
+    scout: Float[np.ndarray, "b 2"],
+    navigator: Float[np.ndarray, "b 2"],
+) -> Float[Tensor, "b w"]:
+    """What reaches waiting navigators at the commit step from stationary scouts, which send from the first step on."""
+    sent_at, rows = commit_step - channel.latency, np.arange(len(content))
+    if sent_at >= 0:
+        channel.send(sent_at, content, scout, rows)
+    return channel.receive(commit_step, navigator, rows)
+
+
+def sent_contents(
     layout: Layout,
     encoder: FrozenEncoder,
     content: str,
     spawn: Float[np.ndarray, "e 3"],
     scout: Float[np.ndarray, "e 3"],
-) -> Float[Tensor, "e slab w"]:
-    """What reaches the navigator at the commit step, under either placement; the scout saw it one step earlier."""
-    camera, wires = FastCamera(layout), []
+) -> Float[Tensor, "e slab c"]:
+    """What the scout sends under either placement while the navigator waits at its spawn."""
+    camera, contents = FastCamera(layout), []
     for slab in range(SLABS):
         slabs = np.full(len(spawn), slab)
         frames = camera.frames(scout, slabs, spawn[:, :2])
@@ -51,21 +76,28 @@ def sent_wires(
         for i in range(0, len(spawn), CHUNK):
             part = slice(i, i + CHUNK)
             still = np.zeros((len(scout[part]), 2))
-            sent = CONTENTS[content](Sender(layout, encoder, frames[part], scout[part], still, slabs[part]))
-            parts.append(deliver(sent, scout[part, :2], spawn[part, :2], layout.communication_radius))
-        wires.append(torch.cat(parts))
-    return torch.stack(wires, dim=1)
+            parts.append(CONTENTS[content](Sender(layout, encoder, frames[part], scout[part], still, slabs[part])))
+        contents.append(torch.cat(parts))
+    return torch.stack(contents, dim=1)
 
 
 def read_bank(
     config: HeadConfig | EvaluationConfig, bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]
 ) -> tuple[Bank, Bank]:
-    """The bank's training draws and its held-out draws, with the wires of the configured content."""
+    """The bank's training draws and its held-out draws, with the configured content."""
     layout, frozen = load_layout(config.layout), FrozenEncoder(encoder, config.device)
-    wires = sent_wires(layout, frozen, config.content, bank["spawn"], bank["scout"])
-    whole = Bank(wires, Outcomes(**{name: bank[name] for name in Outcomes._fields}))
-    held_out = int(len(wires) * config.held_out)
+    spawn, scout = bank["spawn"], bank["scout"]
+    contents = sent_contents(layout, frozen, config.content, spawn, scout)
+    outcomes = Outcomes(**{name: bank[name] for name in Outcomes._fields})
+    whole = Bank(contents, scout[:, :2], spawn[:, :2], outcomes, bank["commit_step"])
+    held_out = held_out_draws(bank)
     return whole.take(slice(held_out, None)), whole.take(slice(held_out))
+
+
+def channel_of(config: HeadConfig | EvaluationConfig, senders: int, width: int, rng: np.random.Generator) -> Channel:
+    """The channel with the configured latency and corruption."""
+    radius = load_layout(config.layout).communication_radius
+    return Channel((senders,), width, radius, config.latency, lambda wire: CORRUPTIONS[config.wire](wire, rng))
 
 
 def train_head(
@@ -85,16 +117,17 @@ def train_head(
     """
     rng = np.random.default_rng([seed, 3])
     training, held_out = read_bank(config, bank, encoder)
-    corrupt = CORRUPTIONS[config.wire]
+    width = training.contents.shape[-1]
+    channel = channel_of(config, config.batch, width, rng)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        head = RouteHead(training.wires.shape[-1])
+        head = RouteHead(ANCHOR + width)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5)
     episodes, updates = [], []
     for start in range(0, config.episodes, config.batch):
         n = min(config.batch, config.episodes - start)
-        entry, slab = rng.integers(0, len(training.wires), n), rng.integers(0, SLABS, n)
-        wire = corrupt(training.wires[entry, slab], rng)
+        entry, slab = rng.integers(0, len(training.contents), n), rng.integers(0, SLABS, n)
+        wire = training.wires(channel, entry, slab)
         with torch.no_grad():
             policy = head.policy(wire)
             route = torch.from_numpy((rng.random(n) < policy.probs[:, 1].numpy()).astype(np.int64))
@@ -106,7 +139,7 @@ def train_head(
         episodes.append(played)
         updates.append((policy.entropy().mean().item(), statistics.value_loss))
         report((start + n) / config.episodes)
-    greedy = evaluate(head, held_out, config.wire, rng)
+    greedy = evaluate(head, held_out, channel_of(config, len(held_out.contents), width, rng), rng)
     names = zip(("entropy", "value_loss"), zip(*updates, strict=True), strict=True)
     return (
         {f"head.{k}": v.numpy() for k, v in head.state_dict().items()}
@@ -117,17 +150,14 @@ def train_head(
 
 
 @torch.no_grad()
-def evaluate(
-    head: RouteHead, held_out: Bank, corruption: str, rng: np.random.Generator, episodes: int | None = None
-) -> dict[str, np.ndarray]:
-    """Greedy choices of a frozen head under a wire condition; every held-out draw under a placement drawn by chance.
+def evaluate(head: RouteHead, held_out: Bank, channel: Channel, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Greedy choices of a frozen head, one episode per sender of the channel, the slab's placement drawn by chance.
 
-    Returns "optimal", "success", "contacts", "length", "route", each (episodes,).
+    The held-out draws are taken in turn. Returns "optimal", "success", "contacts", "length", "route", each (episodes,).
     """
-    n = episodes or len(held_out.wires)
-    entry, slab = np.arange(n) % len(held_out.wires), rng.integers(0, SLABS, n)
-    wire = CORRUPTIONS[corruption](held_out.wires[entry, slab], rng)
-    route = head.policy(wire).logits.argmax(1).numpy()
+    n = channel.senders
+    entry, slab = np.arange(n) % len(held_out.contents), rng.integers(0, SLABS, n)
+    route = head.policy(held_out.wires(channel, entry, slab)).logits.argmax(1).numpy()
     played = _played(held_out.outcomes, entry, slab, route)
     played.pop("returns")
     return played | {"route": route}
@@ -161,7 +191,9 @@ def evaluate_head(
 ) -> dict:
     """One cell of Table IV: a frozen trained head under one wire condition, greedily."""
     _, held_out = read_bank(config, bank, encoder)
-    return evaluate(read_head(head), held_out, config.wire, np.random.default_rng([seed, 4]), config.episodes)
+    rng = np.random.default_rng([seed, 4])
+    channel = channel_of(config, config.episodes, held_out.contents.shape[-1], rng)
+    return evaluate(read_head(head), held_out, channel, rng)
 
 
 def read_head(result: Mapping[str, np.ndarray]) -> RouteHead:

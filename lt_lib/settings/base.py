@@ -1,9 +1,9 @@
 """What all settings share: their base, the scene and the device, and the one-line error for people."""
 
 import hashlib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, computed_field, model_validator
@@ -39,6 +39,7 @@ class Settings(BaseModel):
     """Base of every configuration: immutable, strictly typed, no unknown keys; lists are taken for tuples."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    decided: ClassVar[tuple[str, ...]] = ()  # fields that a study decides, run by run; a profile may not set them
 
     @model_validator(mode="before")
     @classmethod
@@ -67,16 +68,40 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 Precision = Literal["float32", "bfloat16"]
+LATENCY = 1  # control steps between sending and arriving, the paper's
 
 
-class Training(Settings):
-    """What every training shares: the scene, and the device that computes it."""
+class Scene(Settings):
+    """What every run shares: the scene."""
 
+    decided = ("layout",)
     layout: str = "default"
-    device: Literal["cpu", "cuda"] = "cpu"
 
     @computed_field
     @property
     def layout_digest(self) -> str:
         """sha256 of the layout's file, so that an edited scene is another setting."""
         return hashlib.sha256(layout_path(self.layout).read_bytes()).hexdigest()
+
+
+class Training(Scene):
+    """What every run with a pixel encoder shares: the scene, and the device that computes it."""
+
+    decided = ("layout", "device")
+    device: Literal["cpu", "cuda"] = "cpu"
+
+
+def everywhere(settings: Any, shared: Mapping[str, Any]) -> Any:
+    """Settings with what is shared put into those of its fields that they have; anything else as it is."""
+    if not isinstance(settings, Settings):
+        return settings
+    return settings.model_copy(update={name: value for name, value in shared.items() if hasattr(settings, name)})
+
+
+def refuse_decided(value: Any, name: str) -> None:
+    """Raises UserError if settings, at any depth, were given a field that their study decides run by run."""
+    if isinstance(value, Settings):
+        for field in value.model_fields_set:
+            if field in value.decided:
+                raise UserError(f"{name}.{field}: the study decides this, run by run; leave it out")
+            refuse_decided(getattr(value, field), f"{name}.{field}")

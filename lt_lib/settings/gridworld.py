@@ -2,14 +2,14 @@
 
 from typing import Annotated
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from lt_lib.settings.base import Settings, Share, Training
-from lt_lib.settings.perception import EncoderConfig
+from lt_lib.settings.base import LATENCY, Scene, Settings, Share
+from lt_lib.settings.perception import ObjectiveConfig
 from lt_lib.settings.ppo import PpoConfig
 
 
-class PatchEncoderConfig(EncoderConfig):
+class PatchEncoderConfig(ObjectiveConfig):
     """Stage 1 in the gridworld, which has about a hundred views where the pixels have any number."""
 
     layout: str = "grid"
@@ -17,7 +17,7 @@ class PatchEncoderConfig(EncoderConfig):
     covariance: NonNegativeFloat = 0.1
 
 
-class PatchGateConfig(Training):
+class PatchGateConfig(Scene):
     """How the gridworld's freeze gates are measured: cross-validation over cells, so many folds."""
 
     layout: str = "grid"
@@ -32,11 +32,13 @@ class PatchGates(Settings):
     rank: NonNegativeFloat = 20.0
 
 
-class GridConfig(Training):
+class GridConfig(Scene):
     """The gridworld's receiver, trained by MAPPO (Sections Implementation, Gridworld)."""
 
+    decided = (*Scene.decided, "content", "latency")
     layout: str = "grid"
-    content: str = "latent"  # a name in comm.grid_wires.GRID_CONTENTS
+    content: str = "latent"  # a name in gridworld.wires.GRID_CONTENTS
+    latency: NonNegativeInt = LATENCY  # steps
     steps: PositiveInt = 1_200_000
     envs: PositiveInt = 64
     rollout: PositiveInt = 512  # steps an environment and update
@@ -45,11 +47,12 @@ class GridConfig(Training):
     ppo: PpoConfig = PpoConfig()
 
 
-class GridEvaluationConfig(Training):
+class GridEvaluationConfig(Scene):
     """A frozen policy of the gridworld under one wire condition."""
 
     layout: str = "grid"
     content: str
+    latency: NonNegativeInt = LATENCY  # steps
     wire: str  # a name in comm.channel.CORRUPTIONS
     episodes: PositiveInt = 256
 
@@ -58,6 +61,7 @@ class GridworldConfig(Settings):
     """All that the gridworld's protocol needs, in one parameter; every stage takes the section's layout."""
 
     layout: str = "grid"
+    latency: NonNegativeInt = LATENCY  # steps
     encoder: PatchEncoderConfig = PatchEncoderConfig()
     gates: PatchGates = PatchGates()
     policy: GridConfig = GridConfig()

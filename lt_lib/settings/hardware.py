@@ -4,13 +4,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from lt_lib.settings.base import Settings, Share, Training
+from lt_lib.settings.base import Scene, Settings, Share, Training
 from lt_lib.settings.perception import EncoderConfig
 
 
 class MatchedEncoderConfig(EncoderConfig):
     """Stage 1 at the camera's optics, floor and walls recoloured in every rollout (Section Hardware)."""
 
+    decided = (*EncoderConfig.decided, "colour", "texture")
     layout: str = "matched"
     frames: PositiveInt = 102_400
     colour: Share = 1.0  # of a material's own colour that a random one replaces; 0 leaves the simulation's
@@ -51,7 +52,7 @@ class BenchConfig(Settings):
     dim: NonNegativeFloat = 1.0  # stops by which the dim state's light is turned down, besides a lamp that is off
 
 
-class SessionConfig(Training):
+class SessionConfig(Scene):
     """One session: so many placements, a few frames of each."""
 
     layout: str = "matched"

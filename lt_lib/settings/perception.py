@@ -4,11 +4,11 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from lt_lib.settings.base import Settings, Share, Training
+from lt_lib.settings.base import Scene, Settings, Share, Training
 
 
-class EncoderConfig(Training):
-    """Stage 1 (Section Implementation); loss weights are ours, see ASSUMPTIONS.md."""
+class ObjectiveConfig(Scene):
+    """Stage 1 for any encoder (Section Implementation); loss weights are ours, see ASSUMPTIONS.md."""
 
     frames: PositiveInt = 204_800
     rollout: Annotated[int, Field(ge=2)] = 32  # frames a rollout
@@ -20,6 +20,10 @@ class EncoderConfig(Training):
     variance: NonNegativeFloat = 25.0
     covariance: NonNegativeFloat = 2.5
     reconstruction: NonNegativeFloat = 1.0
+
+
+class EncoderConfig(ObjectiveConfig, Training):
+    """Stage 1 for the pixel encoder."""
 
 
 class GateConfig(Training):

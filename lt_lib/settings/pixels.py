@@ -1,8 +1,9 @@
 """Settings of the rendered-pixel study."""
 
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from lt_lib.settings.base import Precision, Share, Training
+from lt_lib.settings.base import LATENCY, Precision, Settings, Share, Training
+from lt_lib.settings.perception import EncoderConfig, GateConfig, Gates
 from lt_lib.settings.ppo import PpoConfig
 
 
@@ -19,20 +20,26 @@ class ExecutorConfig(Training):
 
 
 class BankConfig(Training):
-    """One shard of the episode bank: the frozen executor on every (draw of the scene, slab, route)."""
+    """One shard of the episode bank: the frozen executor on every (draw of the scene, slab, route).
+
+    The bank owns the draws that are held out for evaluation and the step at which a route is commanded: whatever
+    trains or evaluates on its scenes reads both from it.
+    """
 
     entries: PositiveInt = 256  # draws of spawn and scout pose
     envs: PositiveInt = 64
-    commit_step: NonNegativeInt = 2
+    commit_step: NonNegativeInt = 2  # control steps that the navigator waits
+    held_out: Share = 0.125  # of the draws, kept for evaluation
     precision: Precision = "float32"
 
 
 class HeadConfig(Training):
     """Stage 2: the route head, trained from episode reward alone (Section Implementation)."""
 
+    decided = (*Training.decided, "content", "wire", "latency")
     content: str = "latent"  # a name in comm.messages.CONTENTS
     wire: str = "intact"  # a name in comm.channel.CORRUPTIONS
-    held_out: Share = 0.125  # of the bank's draws, kept for evaluation
+    latency: NonNegativeInt = LATENCY  # control steps
     episodes: PositiveInt = 6_000
     batch: PositiveInt = 256
     minibatch: PositiveInt = 64
@@ -43,24 +50,49 @@ class HeadConfig(Training):
 class EvaluationConfig(Training):
     """One cell of Table IV: a frozen head under one wire condition."""
 
+    decided = (*Training.decided, "content", "wire", "latency")
     content: str
     wire: str
-    held_out: Share = 0.125
+    latency: NonNegativeInt = LATENCY  # control steps
     episodes: PositiveInt = 256
 
 
 class RedrawConfig(Training):
     """The route head trained live, its route drawn anew every so many control steps (lower block of Table III)."""
 
+    decided = (*Training.decided, "content", "every", "credit", "latency")
     content: str = "latent"  # a name in comm.messages.CONTENTS
+    latency: NonNegativeInt = LATENCY  # control steps
     every: NonNegativeInt = 0  # control steps between draws, the paper's k; 0: one draw an episode
     credit: str = "episode"  # a name in learners.redraw.CREDITS
-    held_out: Share = 0.125  # of the bank's draws, as for the heads that train on the bank
     episodes: PositiveInt = 6_000
     batch: PositiveInt = 256  # episodes
     minibatch: PositiveInt = 64  # episodes' worth of draws
     lr: PositiveFloat = 3e-3
     ppo: PpoConfig = PpoConfig()
     envs: PositiveInt = 64
-    commit_step: NonNegativeInt = 2
     precision: Precision = "float32"
+
+
+class PixelsConfig(Settings):
+    """All that the pixel protocol needs, in one parameter; layout and device are parameters of their own."""
+
+    latency: NonNegativeInt = LATENCY  # control steps, of every channel
+    encoder: EncoderConfig = EncoderConfig()
+    probe: GateConfig = GateConfig()
+    gates: Gates = Gates()
+    executor: ExecutorConfig = ExecutorConfig()
+    bank: BankConfig = BankConfig()
+    shards: PositiveInt = 8  # runs that the bank is split into, each of `bank.entries` draws
+    head: HeadConfig = HeadConfig()
+    redraw: RedrawConfig = RedrawConfig()
+
+    @model_validator(mode="after")
+    def _draws_for_training_and_for_evaluation(self) -> "PixelsConfig":
+        draws, held_out = self.shards * self.bank.entries, self.bank.held_out
+        if not 1 <= int(draws * held_out) < draws:
+            raise ValueError(
+                f"a bank of {self.shards} x {self.bank.entries} draws with a share of {held_out} held out leaves none "
+                "to train on or none to evaluate on; give it more entries, or another held_out"
+            )
+        return self

@@ -10,12 +10,11 @@ from typing import Annotated, Any, Literal, get_args
 import yaml
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
-from lt_lib.settings.base import ROOT, UserError, require_known
+from lt_lib.settings.base import ROOT, UserError, refuse_decided, require_known
 from lt_lib.settings.gridworld import GridworldConfig
 from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, RailsConfig, SessionsConfig
 from lt_lib.settings.learnability import Budget, PointMassConfig
-from lt_lib.settings.perception import EncoderConfig, GateConfig, Gates
-from lt_lib.settings.pixels import BankConfig, ExecutorConfig, HeadConfig, RedrawConfig
+from lt_lib.settings.pixels import ExecutorConfig, PixelsConfig
 from lt_lib.settings.speed import Stretch
 from lt_lib.settings.velocity import Configuration, NavigatorConfig, RolloutConfig
 
@@ -105,11 +104,21 @@ def _check_value(where: str, key: str, value: Any, declared: Mapping[str, Any]) 
         raise UserError(f"{where}: {key}: expected {expected} such as {declared[key]!r}, got {value!r}")
     if key in SECTIONS:
         try:
-            TypeAdapter(SECTIONS[key]).validate_python(value, strict=True)
-        except ValidationError as error:
-            raise UserError(f"{where}: {explain(error, key, SECTIONS[key])}") from None
+            validated(SECTIONS[key], key, value)
+        except UserError as error:
+            raise UserError(f"{where}: {error}") from None
     elif isinstance(value, dict):
         raise UserError(f"{where}: {key}: SECTIONS has no settings for it; there are {_listed(SECTIONS)}")
+
+
+def validated(kind: Any, name: str, value: Any) -> Any:
+    """What a notebook's or a profile's parameter means. Raises UserError, one line, if it cannot be used."""
+    try:
+        settings = TypeAdapter(kind).validate_python(value, strict=True)
+    except ValidationError as error:
+        raise UserError(explain(error, name, kind)) from None
+    refuse_decided(settings, name)
+    return settings
 
 
 def _same_type(value: Any, default: Any) -> bool:
@@ -126,7 +135,7 @@ def explain(error: ValidationError, name: str, settings: Any) -> str:
     if first["type"] == "extra_forbidden":
         for part in first["loc"][:-1]:
             settings, name = _inside(settings, part), f"{name}.{part}"
-        return f"{place}: unknown parameter; {name} has {_listed(settings.model_fields)}"
+        return f"{place}: unknown parameter; {name} has {_listed(set(settings.model_fields) - set(settings.decided))}"
     complaint = first["msg"].replace("Input should be", "must be")
     return f"{place}: {complaint}, got {first['input']!r}"
 
@@ -144,13 +153,8 @@ def _listed(names: Any) -> str:
 
 # How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
 SECTIONS: dict[str, Any] = {
-    "encoder": EncoderConfig,
-    "probe": GateConfig,
-    "gates": Gates,
+    "pixels": PixelsConfig,
     "executor": ExecutorConfig,
-    "bank": BankConfig,
-    "head": HeadConfig,
-    "redraw": RedrawConfig,
     "gridworld": GridworldConfig,
     "peek_seeds": dict[str, PositiveInt],
     "ablation_seeds": PositiveInt,
@@ -170,7 +174,6 @@ SECTIONS: dict[str, Any] = {
     "draws": PositiveInt,
     "stretch": Stretch,
     "seeds": dict[str, PositiveInt],
-    "shards": PositiveInt,
     "more_seeds": PositiveInt,
     "latent_heads": PositiveInt,
     "episodes": PositiveInt,

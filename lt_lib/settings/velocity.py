@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from lt_lib.settings.base import Precision, Settings, Share, Training
+from lt_lib.settings.base import LATENCY, Precision, Settings, Share, Training
 from lt_lib.settings.ppo import PpoConfig
 
 # The six direct transfers to velocity control, by what each varies (velocity/transfer.py)
@@ -26,7 +26,9 @@ class Boost(Settings):
 class NavigatorConfig(Training):
     """A navigator without a route: PPO from the team's reward (Section From Grid Actions to Velocity Commands)."""
 
+    decided = (*Training.decided, "content", "latency", "blocked", "starts", "boost")
     content: str = "floor"  # a name in comm.messages.CONTENTS
+    latency: NonNegativeInt = LATENCY  # control steps
     blocked: Literal["random", "left", "right"] = "random"  # the slab's corridor; a fixed one leaves no choice
     hazard: NonNegativeFloat = 1.0  # penalty of reaching the slab
     starts: Literal["anywhere", "beyond"] = "beyond"  # the curriculum's: the free arena, or past the mouths alone
@@ -53,7 +55,11 @@ class Exploration(Settings):
 class RolloutConfig(Training):
     """Episodes of a frozen navigator, no learning."""
 
+    decided = (
+        *Training.decided, "content", "latency", "start", "blocked", "truthful", "rows", "precision",
+    )  # fmt: skip
     content: str = "floor"
+    latency: NonNegativeInt = LATENCY  # control steps
     start: Literal["spawn", "left", "right"] = "spawn"  # or in front of a corridor's mouth
     blocked: Literal["random", "left", "right"] = "random"
     truthful: bool = True  # whether an oracle's message is true or flipped

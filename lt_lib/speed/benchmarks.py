@@ -27,7 +27,7 @@ from lt_lib.learnability.score_function import train_point_mass
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.episodes import SLABS, Draws, draw_scenes, roll_bank
 from lt_lib.pixels.executor import FrozenExecutor
-from lt_lib.pixels.protocol import Protocol
+from lt_lib.pixels.protocol import PixelProtocol
 from lt_lib.pixels.redraw import train_redrawn_head
 from lt_lib.pixels.route import train_head
 from lt_lib.report.style import ROLES
@@ -97,12 +97,14 @@ class BankCost(NamedTuple):
         return self.bank + count * self.head, count * self.live
 
 
-def bank_against_live(protocol: Protocol, bank: Result, encoder: Result, executor: Result, episodes: int) -> BankCost:
+def bank_against_live(
+    protocol: PixelProtocol, bank: Result, encoder: Result, executor: Result, episodes: int
+) -> BankCost:
     """What a head costs either way, from so many live episodes and a bank of so many draws, scaled to the real ones."""
     frozen = {"encoder": encoder, "executor": executor}
     scenes = {name: bank[name] for name in ("spawn", "scout")}
-    rolled = protocol.bank.model_copy(update={"entries": episodes})
-    once = protocol.redraw.model_copy(
+    rolled = protocol.sizes.bank.model_copy(update={"entries": episodes})
+    once = protocol.sizes.redraw.model_copy(
         update={
             "every": 0,
             "content": "latent",
@@ -113,14 +115,14 @@ def bank_against_live(protocol: Protocol, bank: Result, encoder: Result, executo
     )
     calls = {
         "bank": lambda: roll_bank(rolled, 0, report=_unheard, **frozen),
-        "head": lambda: train_head(protocol.head, 0, report=_unheard, bank=bank, encoder=encoder),
+        "head": lambda: train_head(protocol.sizes.head, 0, report=_unheard, bank=bank, encoder=encoder),
         "live": lambda: train_redrawn_head(once, 0, report=_unheard, scenes=scenes, **frozen),
     }
     seconds = taking_turns(calls, 1)
     return BankCost(
-        seconds["bank"] * protocol.bank.entries * protocol.shards / episodes,
+        seconds["bank"] * protocol.sizes.bank.entries * protocol.shards / episodes,
         seconds["head"],
-        seconds["live"] * protocol.head.episodes / episodes,
+        seconds["live"] * protocol.sizes.head.episodes / episodes,
     )
 
 
@@ -209,10 +211,10 @@ def of_seeds(config: PointMassConfig, sizes: Sequence[int]) -> dict[int, Callabl
 
 
 def of_episodes(
-    protocol: Protocol, bank: Result, encoder: Result, sizes: Sequence[int]
+    protocol: PixelProtocol, bank: Result, encoder: Result, sizes: Sequence[int]
 ) -> dict[int, Callable[[], dict]]:
     """A route head trained on the bank for so many episodes."""
-    configs = {n: protocol.head.model_copy(update={"episodes": n}) for n in sizes}
+    configs = {n: protocol.sizes.head.model_copy(update={"episodes": n}) for n in sizes}
     inputs = {"bank": bank, "encoder": encoder}
     return {n: lambda each=each: train_head(each, 0, report=_unheard, **inputs) for n, each in configs.items()}
 
@@ -261,7 +263,7 @@ def profiles(calls: Mapping[str, Callable[[], Any]], most: int) -> pd.DataFrame:
 
 
 def training_stretches(
-    protocol: Protocol, bank: Result, encoder: Result, executor: Result, episodes: int, steps: int, frames: int
+    protocol: PixelProtocol, bank: Result, encoder: Result, executor: Result, episodes: int, steps: int, frames: int
 ) -> dict[str, Callable[[], dict]]:
     """Stretches of the trainings that take the most time, by stage, to be profiled.
 
@@ -269,10 +271,12 @@ def training_stretches(
     """
     frozen = {"encoder": encoder, "executor": executor}
     scenes = {name: bank[name] for name in ("spawn", "scout")}
-    head = protocol.redraw.model_copy(
+    head = protocol.sizes.redraw.model_copy(
         update={"every": 1, "content": "latent", "credit": "episode", "episodes": episodes}
     )
-    navigator = NavigatorConfig(steps=steps, layout=protocol.encoder.layout, precision=protocol.redraw.precision)
+    navigator = NavigatorConfig(
+        steps=steps, layout=protocol.sizes.encoder.layout, precision=protocol.sizes.redraw.precision
+    )
     matched = MatchedEncoderConfig(frames=frames, texture=0.1)
     return {
         "train_redrawn_head": lambda: train_redrawn_head(head, 0, report=_unheard, scenes=scenes, **frozen),

@@ -13,8 +13,9 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, FrozenEncoder
 from lt_lib.pixels.episodes import SLABS, draw_scenes
+from lt_lib.settings.base import LATENCY
 from lt_lib.settings.velocity import RolloutConfig
-from lt_lib.velocity.navigator import LATERAL, Mailbox, Navigator, read_navigator
+from lt_lib.velocity.navigator import LATERAL, Navigator, Scouts, read_navigator
 from lt_lib.velocity.noise import Ar1
 
 APPROACH = 40  # control steps before the mouths: where the bit's effect on the lateral mean is measured
@@ -73,6 +74,7 @@ def play(
     imposed: Imposed,
     horizon: int,
     rng: np.random.Generator,
+    latency: int = LATENCY,
     report: Callable[[float], None] = lambda _: None,
 ) -> Episodes:
     """Drives E episodes side by side, each from a fresh draw of the scene to the goal or the time-out.
@@ -80,19 +82,19 @@ def play(
     slab, told  (E,) 0 left, 1 right: the blocked corridor, and what an oracle's message says it is
     """
     n = len(slab)
-    arena, camera, mailbox = Arena(layout, n), FastCamera(layout), Mailbox(layout, encoder, content, n)
+    arena, camera = Arena(layout, n), FastCamera(layout)
+    scouts, liars = (Scouts(layout, encoder, content, n, latency) for _ in range(2))
     draws, chains = draw_scenes(layout, n, rng), Ar1(imposed.tau, rng)
     arena.reset(np.ones(n, bool), draws.spawn, slab, draws.scout)
-    mailbox.send(np.ones(n, bool), arena, told)
-    flipped = Mailbox(layout, encoder, content, n)
-    flipped.send(np.ones(n, bool), arena, 1 - told)
+    scouts.look(np.ones(n, bool), arena, told)
+    liars.look(np.ones(n, bool), arena, 1 - told)
     live, done = np.ones(n, bool), _blank(n, horizon)
     std = navigator.log_std.exp()
     for age in range(horizon):
         ages = np.full(n, age)
         latent = encoder.latent(camera.frames(arena.pose[live], slab[live], arena.scout[live, :2])).cpu()
-        mean = navigator.mean(latent, mailbox.wires(arena, ages)[live])
-        other = navigator.mean(latent, flipped.wires(arena, ages)[live])
+        mean = navigator.mean(latent, scouts.wires(arena, ages)[live])
+        other = navigator.mean(latent, liars.wires(arena, ages)[live])
         shift = ((other - mean)[:, LATERAL].abs() / std[LATERAL]).numpy()
         done.shift[live] += np.column_stack([shift * (age < APPROACH), shift])
         chain = chains.step(ages == 0)[live]
@@ -171,6 +173,7 @@ def roll_navigator(
         imposed,
         config.horizon,
         rng,
+        config.latency,
         report,
     )
     shaped = {name: values.reshape(*shape, *values.shape[1:]) for name, values in done._asdict().items()}

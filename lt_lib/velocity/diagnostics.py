@@ -10,7 +10,8 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import SIDES, Layout
 from lt_lib.perception.encoder import ACTION, FrozenEncoder
 from lt_lib.pixels.episodes import draw_scenes
-from lt_lib.velocity.navigator import Mailbox
+from lt_lib.settings.base import LATENCY
+from lt_lib.velocity.navigator import Scouts
 
 SETTLED = 2  # control steps after which a new command's velocity is reached
 
@@ -24,15 +25,18 @@ def probe_accuracy(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.r
     return float(probe.score(latents[half:], slab[half:]))
 
 
-def message_error(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator) -> float:
-    """Largest difference between any float that the scout sent and the one that the navigator has a step later."""
+def message_error(
+    layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator, latency: int = LATENCY
+) -> float:
+    """Largest difference between any float that the scout sent and the one that arrives after the latency."""
     slab, scenes, everyone = rng.integers(0, len(SIDES), draws), draw_scenes(layout, draws, rng), np.ones(draws, bool)
-    arena, mailbox = Arena(layout, draws), Mailbox(layout, encoder, "latent", draws)
+    arena, scouts = Arena(layout, draws), Scouts(layout, encoder, "latent", draws, latency)
     arena.reset(everyone, scenes.spawn, slab, scenes.scout)
-    mailbox.send(everyone, arena, slab)
+    scouts.look(everyone, arena, slab)
     sent = encoder.latent(FastCamera(layout).frames(scenes.scout, slab, scenes.spawn[:, :2])).cpu()
-    arena.step(np.zeros((draws, ACTION)))
-    received = mailbox.wires(arena, np.ones(draws, np.int64))[:, ANCHOR:]
+    for age in range(latency + 1):
+        received = scouts.wires(arena, np.full(draws, age))[:, ANCHOR:]
+        arena.step(np.zeros((draws, ACTION)))
     return float((received - sent).abs().max())
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lt_lib import ppo
-from lt_lib.comm.channel import ANCHOR, LATENCY, deliver
+from lt_lib.comm.channel import ANCHOR, Channel
 from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
 from lt_lib.envs.arena import NO_CORRIDOR, Arena
 from lt_lib.envs.camera import FastCamera
@@ -81,24 +81,25 @@ def read_navigator(result: Mapping[str, np.ndarray]) -> Navigator:
     return navigator
 
 
-class Mailbox:
-    """What the stationary scout sends: its frame of the episode's start, once, then held; the anchor is each step's."""
+class Scouts:
+    """Stationary scouts: each repeats, at every step, what it makes of its frame of the episode's start."""
 
-    def __init__(self, layout: Layout, encoder: FrozenEncoder, content: str, n: int):
+    def __init__(self, layout: Layout, encoder: FrozenEncoder, content: str, n: int, latency: int):
         self._layout, self._encoder, self._write = layout, encoder, CONTENTS[content]
         self._camera, self._held = FastCamera(layout), torch.zeros(n, CONTENT)
+        self._channel = Channel((n,), CONTENT, layout.communication_radius, latency)
 
-    def send(self, which: Bool[np.ndarray, " n"], arena: Arena, slab: Int[np.ndarray, " n"]):
-        """New messages for the episodes of `which`; `slab` is what the oracle says of each."""
+    def look(self, which: Bool[np.ndarray, " n"], arena: Arena, slab: Int[np.ndarray, " n"]):
+        """New contents for the episodes of `which`; `slab` is what the oracle says of each."""
         scout = arena.scout[which]
         frames = self._camera.frames(scout, arena.slab[which], arena.pose[which, :2])
         sent = Sender(self._layout, self._encoder, frames, scout, np.zeros((len(scout), 2)), slab[which])
         self._held[torch.from_numpy(which)] = self._write(sent)
 
     def wires(self, arena: Arena, age: Int[np.ndarray, " n"]) -> Float[Tensor, "n 66"]:
-        """What has reached the navigators: nothing before the channel's latency has passed."""
-        wire = deliver(self._held, arena.scout[:, :2], arena.pose[:, :2], self._layout.communication_radius)
-        return wire * torch.from_numpy(age >= LATENCY)[:, None]
+        """Has every scout send, and returns what reaches the navigators; to be called at every step of an episode."""
+        self._channel.send(age, self._held, arena.scout[:, :2])
+        return self._channel.receive(age, arena.pose[:, :2])
 
 
 class Step(NamedTuple):
@@ -120,7 +121,7 @@ class Errand:
         n, layout = config.envs, load_layout(config.layout)
         self._config, self._layout, self._encoder, self._rng = config, layout, encoder, rng
         self._arena, self._camera, self._distance = Arena(layout, n), FastCamera(layout), RouteDistance(layout)
-        self._mailbox = Mailbox(layout, encoder, config.content, n)
+        self._scouts = Scouts(layout, encoder, config.content, n, config.latency)
         self.age, self._first = np.zeros(n, np.int64), np.full(n, NO_CORRIDOR)
         self._from_spawn = np.zeros(n, bool)
         self.finished: list[np.ndarray] = []
@@ -131,7 +132,7 @@ class Errand:
         latent = self._encoder.latent(self._camera.frames(arena.pose, arena.slab, arena.scout[:, :2])).cpu()
         slab = F.one_hot(torch.from_numpy(arena.slab), len(SIDES)).float()
         inside = torch.from_numpy(self.age < self._config.boost.window)[:, None]
-        return torch.cat([latent, self._mailbox.wires(arena, self.age), 1 + (boost - 1) * inside, slab], dim=1)
+        return torch.cat([latent, self._scouts.wires(arena, self.age), 1 + (boost - 1) * inside, slab], dim=1)
 
     def step(self, action: Float[np.ndarray, "n 3"], boost: float) -> Step:
         before = self._potential()
@@ -166,7 +167,7 @@ class Errand:
         self._arena.reset(which, np.where(spawn[:, None], layout.spawn.sample(n, rng), elsewhere), slab, scout)
         self._from_spawn = np.where(which, spawn, self._from_spawn)
         self._first[which], self.age[which] = NO_CORRIDOR, 0
-        self._mailbox.send(which, self._arena, self._arena.slab)
+        self._scouts.look(which, self._arena, self._arena.slab)
 
 
 def train_navigator(

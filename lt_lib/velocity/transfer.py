@@ -9,8 +9,10 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from lt_lib.envs.layout import SIDES
-from lt_lib.pixels.protocol import Protocol
+from lt_lib.pixels.protocol import PixelProtocol
+from lt_lib.settings.base import everywhere
 from lt_lib.settings.ppo import PpoConfig
+from lt_lib.settings.profiles import validated
 from lt_lib.settings.velocity import Boost, Exploration, NavigatorConfig, RolloutConfig
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -68,11 +70,11 @@ class Transfer:
     rollout: RolloutConfig
 
     @classmethod
-    def of(cls, protocol: Protocol, navigator: Mapping[str, Any], rollout: Mapping[str, Any]) -> "Transfer":
+    def of(cls, protocol: PixelProtocol, navigator: Mapping[str, Any], rollout: Mapping[str, Any]) -> "Transfer":
         """From a notebook's parameters; the dicts are those of `settings.profiles.SECTIONS`. Raises GateError."""
-        shared = {"layout": protocol.encoder.layout, "device": protocol.encoder.device}
-        configs = NavigatorConfig(**shared, **navigator), RolloutConfig(**shared, **rollout)
-        return cls(protocol.store, protocol.frozen_encoder(), *configs)
+        given = validated(NavigatorConfig, "navigator", navigator), validated(RolloutConfig, "rollout", rollout)
+        shared = {name: getattr(protocol.sizes.head, name) for name in ("layout", "device", "latency")}
+        return cls(protocol.store, protocol.frozen_encoder(), *(everywhere(each, shared) for each in given))
 
     def navigators(self, configurations: Sequence[str], oracle_seeds: int) -> dict[str, list[Result]]:
         """All navigators trained from scratch, by name: one of each, `oracle_seeds` of those that are told the bit."""
@@ -128,7 +130,7 @@ class Transfer:
 
     def _rollout(self, name: str, **changes: Any) -> RolloutConfig:
         trained = self._config(name)
-        shared = {key: getattr(trained, key) for key in ("layout", "device", "content", "precision")}
+        shared = {key: getattr(trained, key) for key in ("layout", "device", "content", "latency", "precision")}
         return self.rollout.model_copy(update=shared | changes)
 
     def _roll(self, config: RolloutConfig, navigator: Result, seed: int = SEED) -> Run:
