@@ -1,9 +1,10 @@
-"""How pytest runs the notebooks: with this checkout's library, and told at once when a kernel dies."""
+"""What pytest runs: notebooks with this checkout's library, a dead kernel told at once, a release only on demand."""
 
 import os
 from pathlib import Path
 from queue import Empty
 
+import pytest
 from nbval.kernel import RunningKernel
 
 ROOT = Path(__file__).resolve().parent
@@ -17,6 +18,17 @@ os.environ.pop("MPLBACKEND", None)  # figures need none, so that an unknown one 
 def pytest_report_header() -> list[str]:
     slow = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
     return ["NUMBA_DISABLE_JIT is set: loops run uncompiled, a hundred times slower"] if slow else []
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Cells of notebooks are slow; tests of a release wait for `-m release`."""
+    for item in items:
+        if item.path.suffix == ".ipynb":
+            item.add_marker("slow")
+    if "release" not in config.option.markexpr:
+        waiting = [item for item in items if item.get_closest_marker("release")]
+        config.hook.pytest_deselected(items=waiting)
+        items[:] = [item for item in items if item not in waiting]
 
 
 class WatchedKernel(RunningKernel):

@@ -458,4 +458,6 @@ def test_an_unknown_setting_inside_a_section_is_named_with_its_neighbours():
     with pytest.raises(ValidationError) as error:
         GridworldConfig(policy={"step": 3}, seeds={})
     told = explain(error.value, "gridworld", GridworldConfig)
-    assert told.startswith("gridworld.policy.step: unknown parameter; gridworld.policy has envs, lr, minibatch, ppo, rollout, steps")
+    assert told.startswith(
+        "gridworld.policy.step: unknown parameter; gridworld.policy has envs, lr, minibatch, ppo, rollout, steps"
+    )

@@ -45,10 +45,10 @@ class PixelProtocol:
 
     @classmethod
     def of(
-        cls, pixels: Mapping[str, Any], layout: str, device: str, workers: int | str, weights: str = ""
+        cls, pixel_study: Mapping[str, Any], layout: str, device: str, workers: int | str, weights: str = ""
     ) -> "PixelProtocol":
         """From a notebook's parameters. Raises UserError for those that cannot be used."""
-        sizes = validated(PixelsConfig, "pixels", pixels)
+        sizes = validated(PixelsConfig, "pixel_study", pixel_study)
         shared = {"layout": layout, "device": computing_device(device), "latency": sizes.latency}
         sizes = sizes.model_copy(update={name: everywhere(each, shared) for name, each in sizes})
         return cls(RunStore(runs_folder(), workers), sizes, layout, ROOT / weights if weights else None)

@@ -153,7 +153,7 @@ def _listed(names: Any) -> str:
 
 # How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
 SECTIONS: dict[str, Any] = {
-    "pixels": PixelsConfig,
+    "pixel_study": PixelsConfig,
     "executor": ExecutorConfig,
     "gridworld": GridworldConfig,
     "peek_seeds": dict[str, PositiveInt],

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy import stats
 
-from lt_lib.comm.channel import ANCHOR, deliver
+from lt_lib.comm.channel import ANCHOR, Channel
 from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.arena import Arena
@@ -28,8 +28,8 @@ from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.episodes import SLABS, Draws, draw_scenes, roll_bank
 from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.pixels.protocol import PixelProtocol
-from lt_lib.pixels.redraw import train_redrawn_head
-from lt_lib.pixels.route import train_head
+from lt_lib.pixels.redraw import SCENES, train_redrawn_head
+from lt_lib.pixels.route import committed_wires, train_head
 from lt_lib.report.style import ROLES
 from lt_lib.settings.hardware import MatchedEncoderConfig
 from lt_lib.settings.learnability import PointMassConfig
@@ -80,7 +80,8 @@ def _choices(layout: Layout, frozen: FrozenEncoder, result: Result, draws: Draws
     head.load_state_dict({k.removeprefix("head."): torch.tensor(v) for k, v in result.items() if k[:5] == "head."})
     still = np.zeros((len(frames), 2))
     sent = CONTENTS["latent"](Sender(layout, frozen, frames, draws.scout, still, slab))
-    wire = deliver(sent, draws.scout[:, :2], draws.spawn[:, :2], layout.communication_radius)
+    channel = Channel((len(sent),), CONTENT, layout.communication_radius)
+    wire = committed_wires(channel, channel.latency, sent, draws.scout[:, :2], draws.spawn[:, :2])
     return head.policy(wire).probs.argmax(1)
 
 
@@ -102,7 +103,7 @@ def bank_against_live(
 ) -> BankCost:
     """What a head costs either way, from so many live episodes and a bank of so many draws, scaled to the real ones."""
     frozen = {"encoder": encoder, "executor": executor}
-    scenes = {name: bank[name] for name in ("spawn", "scout")}
+    scenes = {name: bank[name] for name in SCENES}
     rolled = protocol.sizes.bank.model_copy(update={"entries": episodes})
     once = protocol.sizes.redraw.model_copy(
         update={
@@ -270,7 +271,7 @@ def training_stretches(
     episodes  of a head that draws at every step;  steps  of a navigator's control;  frames  of a matched encoder
     """
     frozen = {"encoder": encoder, "executor": executor}
-    scenes = {name: bank[name] for name in ("spawn", "scout")}
+    scenes = {name: bank[name] for name in SCENES}
     head = protocol.sizes.redraw.model_copy(
         update={"every": 1, "content": "latent", "credit": "episode", "episodes": episodes}
     )

@@ -7,7 +7,7 @@ import pandas as pd
 import torch
 
 from lt_lib import ppo
-from lt_lib.comm.channel import deliver
+from lt_lib.comm.channel import Channel
 from lt_lib.comm.messages import Sender
 from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.gridworld import table_ppo
@@ -56,7 +56,9 @@ class _Tables(_Learner):
     def sample(self):
         with torch.no_grad():
             log_probs, values = self.team.log_probs(), self.team.values()
-        walks, self.states = walk(self.grid, log_probs.exp().numpy(), self.states, self.config.rollout, self.rng)
+        walks, self.states = walk(
+            self.grid, log_probs.exp().numpy(), self.states, self.config.rollout, self.rng, self.config.latency
+        )
         return batch(log_probs, values, walks, self.config.ppo)
 
     def improve(self, sampled) -> None:
@@ -67,7 +69,8 @@ class _Tables(_Learner):
 class _Plain(_Learner):
     def __init__(self, grid: Grid, frozen: FrozenPatchEncoder, team: Team, config: GridConfig):
         super().__init__(grid, team, config)
-        self.frozen = frozen
+        self.frozen, width = frozen, team.inputs.contents.shape[-1]
+        self.channel = Channel((config.envs,), width, grid.layout.communication_radius, config.latency)
 
     @torch.no_grad()
     def sample(self) -> ppo.Batch:
@@ -92,13 +95,13 @@ class _Plain(_Learner):
         cell, slab, post, clock = self.states
         own = self.frozen.latent(self.grid.patches[cell, slab])
         policy = torch.distributions.Categorical(
-            logits=self.team.actor(own, self._wire()[:, None], torch.from_numpy(clock > 0)[:, None])
+            logits=self.team.actor(own, self._wire()[:, None], torch.from_numpy(clock >= self.config.latency)[:, None])
         )
         action = policy.sample()
         there = self.grid.following[cell, action.numpy()]
         arrived, blocked = self.grid.goal[there], self.grid.slab[slab, there]
         ended = arrived | blocked | (clock + 1 == HORIZON)
-        seen = torch.from_numpy(np.stack([self.states.message, cell, slab], axis=1))
+        seen = torch.from_numpy(np.stack([self.states.message(self.config.latency), cell, slab], axis=1))
         reward = np.where(arrived, GOAL_REWARD, np.where(blocked, SLAB_REWARD, STEP_REWARD)).astype(np.float32)
         values = [self.team.critic(torch.from_numpy(c * len(SIDES) + slab)) for c in (cell, there)]
         new = first_states(self.grid, len(cell), self.rng)
@@ -107,9 +110,9 @@ class _Plain(_Learner):
         return seen, action, policy.log_prob(action), values[0], torch.from_numpy(reward), values[1], *flags
 
     def _wire(self):
-        cell, slab, post, _ = self.states
+        cell, slab, post, clock = self.states
         pose = np.pad(self.grid.centres[self.grid.posts[post]], ((0, 0), (0, 1)))
         frames = self.grid.patches[self.grid.posts[post], slab]
         sender = Sender(self.grid.layout, self.frozen, frames, pose, np.zeros((len(cell), 2)), slab)
-        sent = GRID_CONTENTS[self.config.content](sender)
-        return deliver(sent, pose[:, :2], self.grid.centres[cell], self.grid.layout.communication_radius)
+        self.channel.send(clock, GRID_CONTENTS[self.config.content](sender), pose[:, :2])
+        return self.channel.receive(clock, self.grid.centres[cell])
