@@ -3,12 +3,13 @@
 Clip 0.2, four epochs, entropy coefficient 0.01, gamma 0.99, lambda 0.95, the same for every seed and condition.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped
-from torch import Tensor
+from torch import Tensor, nn
 
 from lt_lib.settings.ppo import PpoConfig
 
@@ -43,6 +44,38 @@ class Statistics(NamedTuple):
     value_loss: float
     entropy: float
     clipped: float  # share of ratios outside the clip
+
+
+class Step(NamedTuple):
+    """One step of n environments side by side; arguments of `advantages` are named as there."""
+
+    observations: Shaped[Tensor, "n d"]
+    actions: Tensor
+    log_probs: Float[Tensor, " n"]
+    values: Float[Tensor, " n"]
+    following: Float[Tensor, " n"]
+    rewards: Float[Tensor, " n"]
+    terminated: Bool[Tensor, " n"]
+    ended: Bool[Tensor, " n"]
+
+
+def mlp(inputs: int, outputs: int, gain: float, hidden: int = 128) -> nn.Sequential:
+    """Two tanh layers, orthogonally initialised, the last layer by `gain`."""
+    layers = [nn.Linear(inputs, hidden), nn.Tanh(), nn.Linear(hidden, hidden), nn.Tanh(), nn.Linear(hidden, outputs)]
+    for layer, scale in zip(layers[::2], (np.sqrt(2), np.sqrt(2), gain), strict=True):
+        nn.init.orthogonal_(layer.weight, scale)
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(*layers)
+
+
+def batch_of(steps: Sequence[Step], config: PpoConfig) -> Batch:
+    """Consecutive steps, with their advantages, as one batch."""
+    taken = Step(*(torch.stack(column) for column in zip(*steps, strict=True)))  # each (t, n, ...)
+    gain = advantages(
+        taken.rewards, taken.values, taken.following, taken.terminated, taken.ended, config.gamma, config.lam
+    )
+    flat = (taken.observations, taken.actions, taken.log_probs, gain, gain + taken.values)
+    return Batch(*(column.flatten(0, 1) for column in flat))
 
 
 def advantages(

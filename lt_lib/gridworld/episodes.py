@@ -15,6 +15,7 @@ from lt_lib.gridworld.patches import FrozenPatchEncoder
 from lt_lib.gridworld.walks import States, first_states
 from lt_lib.settings.base import LATENCY
 from lt_lib.settings.gridworld import GridEvaluationConfig
+from lt_lib.store.states import restored
 
 Choice = Callable[[Float[Tensor, "n 5"], np.random.Generator], Int[np.ndarray, " n"]]
 
@@ -112,7 +113,5 @@ def rerouted(grid: Grid, cells: Int[np.ndarray, "n t"]) -> Bool[np.ndarray, " n"
 
 def read_actor(policy: Mapping[str, np.ndarray]) -> Actor:
     """The trained actor in a result of `train_grid`."""
-    weights = {k.removeprefix("actor."): torch.tensor(v) for k, v in policy.items() if k.startswith("actor.")}
-    actor = Actor(weights["receiver.value.weight"].shape[1])
-    actor.load_state_dict(weights)
-    return actor.requires_grad_(False)
+    width = policy["actor.receiver.value.weight"].shape[1]
+    return restored(Actor(width), policy, "actor").requires_grad_(False)

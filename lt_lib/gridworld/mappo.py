@@ -27,6 +27,7 @@ from lt_lib.gridworld.wires import anchors, contents_sent
 from lt_lib.perception.encoder import LATENT
 from lt_lib.settings.gridworld import GridConfig
 from lt_lib.settings.ppo import PpoConfig
+from lt_lib.store.states import state_of
 
 WIDTH = 64  # of every hidden layer
 
@@ -159,7 +160,7 @@ def train_grid(
         ended.append(walks.ended.sum())
         updates.append((statistics.entropy, statistics.value_loss))
         report((update + 1) / total)
-    return {f"actor.{k}": v.numpy() for k, v in team.actor.state_dict().items()} | {
+    return state_of(team.actor, "actor") | {
         "success": np.concatenate(success),
         "length": np.concatenate(length).astype(np.int16),
         "ended": np.cumsum(ended),

@@ -22,6 +22,7 @@ from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
+from lt_lib.store.states import only
 
 SEED = 0  # of the one encoder; receivers have seeds of their own
 OURS, WITHOUT, UNTRAINED, ALONE = "ours", "without reconstruction", "untrained", "prediction alone"
@@ -99,7 +100,7 @@ class GridProtocol:
                 evaluate_grid,
                 GridEvaluationConfig(content=content, wire=wire, episodes=episodes, **shared),
                 SEED,
-                {"policy": _actor_only(policy), "encoder": _frozen(encoder)},
+                {"policy": only(policy, "actor"), "encoder": _frozen(encoder)},
             )
             for content, trained in policies.items()
             for seed, policy in enumerate(trained)
@@ -118,7 +119,3 @@ class GridProtocol:
 def _frozen(encoder: Result) -> Result:
     """Weights and normalisation alone: how the training went does not concern those who use it."""
     return {name: value for name, value in encoder.items() if not name.startswith("loss.")}
-
-
-def _actor_only(policy: Result) -> Result:
-    return {name: value for name, value in policy.items() if name.startswith("actor.")}

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from lt_lib.envs.camera import looked_up
 from lt_lib.envs.materials import PALETTE
+from lt_lib.store.states import restored
 
 LATENT = 64
 ACTION = 3
@@ -67,11 +68,8 @@ class Frozen:
     def __init__(self, encoder: nn.Module, weights: Mapping[str, np.ndarray], device: str, precision: str):
         self.device, self.dtype = torch.device(device), getattr(torch, precision)
         self._encoder, self._predictor = encoder, Predictor()
-        for module, prefix in ((self._encoder, "E."), (self._predictor, "P.")):
-            module.load_state_dict(
-                {k.removeprefix(prefix): torch.tensor(v) for k, v in weights.items() if k.startswith(prefix)}
-            )
-            module.to(self.device, self.dtype).requires_grad_(False)
+        for module, prefix in ((self._encoder, "E"), (self._predictor, "P")):
+            restored(module, weights, prefix).to(self.device, self.dtype).requires_grad_(False)
         self._mean = torch.tensor(weights["mean"], device=self.device)
         self._std = torch.tensor(weights["std"], device=self.device)
 

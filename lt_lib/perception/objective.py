@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from lt_lib.perception.encoder import LATENT, Predictor
 from lt_lib.settings.perception import ObjectiveConfig
+from lt_lib.store.states import state_of
 
 
 class Losses(NamedTuple):
@@ -126,7 +127,6 @@ def fit(
 def frozen(model: Jepa, latents: Float[np.ndarray, "n 64"]) -> dict[str, np.ndarray]:
     """What is kept of E and P: weights "E.*" and "P.*", and "mean", "std" (64,) of E's latents of training frames."""
     latents = latents.astype(np.float64)
-    modules = (("E", model.encoder), ("P", model.predictor))
-    weights = {f"{p}.{k}": v.cpu().numpy() for p, module in modules for k, v in module.state_dict().items()}
+    weights = state_of(model.encoder, "E") | state_of(model.predictor, "P")
     std = latents.std(axis=0, ddof=1) + 1e-6
     return weights | {"mean": latents.mean(axis=0).astype(np.float32), "std": std.astype(np.float32)}

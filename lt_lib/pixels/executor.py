@@ -22,7 +22,6 @@ from lt_lib.perception.frames import free_poses
 from lt_lib.settings.pixels import ExecutorConfig
 
 ROUTES = 2
-HIDDEN = 128
 FROM_SPAWN = 0.5  # share of pretraining episodes that start at the spawn
 TIME_LIMIT = 300  # control steps of a pretraining episode; a time-out is bootstrapped, not punished
 ENTERED, DISOBEYED, ARRIVED, BLOCKED = (
@@ -38,26 +37,12 @@ class Executor(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.mean, self.critic = _mlp(ACTION, 0.01), _mlp(1, 1.0)
+        self.mean, self.critic = ppo.mlp(LATENT + ROUTES, ACTION, 0.01), ppo.mlp(LATENT + ROUTES, 1, 1.0)
         self.log_std = nn.Parameter(torch.full((ACTION,), -0.5))
 
     def evaluate(self, observations: Float[Tensor, "b d"], actions: Float[Tensor, "b 3"]):
         policy = torch.distributions.Normal(self.mean(observations), self.log_std.exp())
         return policy.log_prob(actions).sum(1), policy.entropy().sum(1), self.critic(observations).squeeze(1)
-
-
-def _mlp(outputs: int, gain: float) -> nn.Sequential:
-    layers = [
-        nn.Linear(LATENT + ROUTES, HIDDEN),
-        nn.Tanh(),
-        nn.Linear(HIDDEN, HIDDEN),
-        nn.Tanh(),
-        nn.Linear(HIDDEN, outputs),
-    ]
-    for layer, scale in zip(layers[::2], (np.sqrt(2), np.sqrt(2), gain), strict=True):
-        nn.init.orthogonal_(layer.weight, scale)
-        nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
 
 
 class FrozenExecutor:
@@ -180,12 +165,7 @@ def _collect(driving: Driving, policy: Executor, config: ExecutorConfig, generat
             rewards, obedient, terminated, ended, final = driving.step(action.cpu().numpy())
             following = policy.critic(final).squeeze(1)
         flags = (torch.from_numpy(a).to(mean.device) for a in (rewards.astype(np.float32), terminated, ended))
-        steps.append((observation, action, log_prob, value, following, *flags))
+        steps.append(ppo.Step(observation, action, log_prob, value, following, *flags))
         ended_count, obedient_count = ended_count + ended.sum(), obedient_count + obedient.sum()
         observation = driving.observe() if ended.any() else final
-    observations, actions, log_probs, values, following, rewards, terminated, ended = (
-        torch.stack(s) for s in zip(*steps, strict=True)
-    )
-    gain = ppo.advantages(rewards, values, following, terminated, ended, config.ppo.gamma, config.ppo.lam)
-    flat = (t.flatten(0, 1) for t in (observations, actions, log_probs, gain, gain + values))
-    return ppo.Batch(*flat), int(ended_count), int(obedient_count)
+    return ppo.batch_of(steps, config.ppo), int(ended_count), int(obedient_count)

@@ -27,6 +27,7 @@ from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
+from lt_lib.store.states import only
 
 SEED = 0  # of the one encoder and the one executor, as in the paper; heads have seeds of their own
 
@@ -154,7 +155,7 @@ class PixelProtocol:
 
     def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
         """A frozen trained head under every wire condition of Table IV, greedily."""
-        inputs = {"head": _weights_only(head), "bank": bank, "encoder": encoder}
+        inputs = {"head": only(head, "head"), "bank": bank, "encoder": encoder}
         shared = {key: getattr(self.sizes.head, key) for key in ("layout", "device", "latency")}
         shared |= {"content": CONDITIONS[name].content, "episodes": episodes}
         configs = [EvaluationConfig(wire=wire, **shared) for wire in CORRUPTIONS]
@@ -169,10 +170,6 @@ class PixelProtocol:
     def _redrawn(self, name: str) -> RedrawConfig:
         row = REDRAWS[name]
         return self.sizes.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
-
-
-def _weights_only(head: Result) -> Result:
-    return {name: value for name, value in head.items() if name.startswith("head.")}
 
 
 def obedience(bank: Result) -> float:

@@ -36,6 +36,7 @@ from lt_lib.pixels.episodes import (
 from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.settings.pixels import RedrawConfig
 from lt_lib.settings.ppo import PpoConfig
+from lt_lib.store.states import state_of
 
 
 class Redraw(NamedTuple):
@@ -260,7 +261,7 @@ def train_redrawn_head(
         report((start + n) / config.episodes)
     entropy, count = zip(*updates, strict=True)
     return (
-        {f"head.{k}": v.numpy() for k, v in head.state_dict().items()}
+        state_of(head, "head")
         | {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}
         | {"entropy": np.array(entropy, np.float32), "draws": np.array(count)}
     )

@@ -21,6 +21,7 @@ from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.episodes import SLABS, Outcomes, held_out_draws
 from lt_lib.settings.pixels import EvaluationConfig, HeadConfig
+from lt_lib.store.states import restored, state_of
 
 CHUNK = 1024  # frames encoded at a time
 
@@ -142,7 +143,7 @@ def train_head(
     greedy = evaluate(head, held_out, channel_of(config, len(held_out.contents), width, rng), rng)
     names = zip(("entropy", "value_loss"), zip(*updates, strict=True), strict=True)
     return (
-        {f"head.{k}": v.numpy() for k, v in head.state_dict().items()}
+        state_of(head, "head")
         | {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}
         | {name: np.array(values, np.float32) for name, values in names}
         | {f"greedy.{name}": values for name, values in greedy.items()}
@@ -198,7 +199,5 @@ def evaluate_head(
 
 def read_head(result: Mapping[str, np.ndarray]) -> RouteHead:
     """The trained head in a result of `train_head`."""
-    weights = {k.removeprefix("head."): torch.tensor(v) for k, v in result.items() if k.startswith("head.")}
-    head = RouteHead(weights["hidden.0.weight"].shape[1])
-    head.load_state_dict(weights)
-    return head.requires_grad_(False)
+    width = result["head.hidden.0.weight"].shape[1]
+    return restored(RouteHead(width), result, "head").requires_grad_(False)

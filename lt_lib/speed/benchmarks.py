@@ -16,9 +16,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy import stats
 
-from lt_lib.comm.channel import ANCHOR, Channel
+from lt_lib.comm.channel import Channel
 from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
-from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
@@ -29,7 +28,7 @@ from lt_lib.pixels.episodes import SLABS, Draws, draw_scenes, roll_bank
 from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.pixels.protocol import PixelProtocol
 from lt_lib.pixels.redraw import SCENES, train_redrawn_head
-from lt_lib.pixels.route import committed_wires, train_head
+from lt_lib.pixels.route import committed_wires, read_head, train_head
 from lt_lib.report.style import ROLES
 from lt_lib.settings.hardware import MatchedEncoderConfig
 from lt_lib.settings.learnability import PointMassConfig
@@ -76,13 +75,11 @@ def precision(layout: Layout, encoder: Result, head: Result, scenes: int, rounds
 
 @torch.no_grad()
 def _choices(layout: Layout, frozen: FrozenEncoder, result: Result, draws: Draws, slab, frames) -> torch.Tensor:
-    head = RouteHead(ANCHOR + CONTENT)
-    head.load_state_dict({k.removeprefix("head."): torch.tensor(v) for k, v in result.items() if k[:5] == "head."})
     still = np.zeros((len(frames), 2))
     sent = CONTENTS["latent"](Sender(layout, frozen, frames, draws.scout, still, slab))
     channel = Channel((len(sent),), CONTENT, layout.communication_radius)
     wire = committed_wires(channel, channel.latency, sent, draws.scout[:, :2], draws.spawn[:, :2])
-    return head.policy(wire).probs.argmax(1)
+    return read_head(result).policy(wire).probs.argmax(1)
 
 
 # --- the episode bank

@@ -23,11 +23,12 @@ from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 from lt_lib.settings.velocity import Boost, NavigatorConfig
+from lt_lib.store.states import restored, state_of
 from lt_lib.velocity.noise import Ar1
 
 WIRE = ANCHOR + CONTENT
 LATERAL = 1  # the action's axis across the robot
-HIDDEN, READ = 128, 32  # units of a hidden layer, floats that the receiver makes of a message
+READ = 32  # floats that the receiver makes of a message
 ARRIVED = 5.0  # reward of the goal
 TIME_LIMIT = 300  # control steps of a training episode; a time-out is bootstrapped, not punished
 
@@ -44,8 +45,8 @@ class Navigator(nn.Module):
         self.message = nn.Linear(WIRE, READ)
         nn.init.zeros_(self.message.weight)
         nn.init.zeros_(self.message.bias)
-        self.velocity = _mlp(LATENT + READ, ACTION, 0.01)
-        self.critic = _mlp(LATENT + WIRE + len(SIDES), 1, 1.0)
+        self.velocity = ppo.mlp(LATENT + READ, ACTION, 0.01)
+        self.critic = ppo.mlp(LATENT + WIRE + len(SIDES), 1, 1.0)
         self.log_std = nn.Parameter(torch.full((ACTION,), -0.5))
 
     def mean(self, latent: Float[Tensor, "b 64"], wire: Float[Tensor, "b 66"]) -> Float[Tensor, "b 3"]:
@@ -65,20 +66,9 @@ class Navigator(nn.Module):
         return policy.log_prob(actions).sum(1), policy.entropy().sum(1), self.value(observations)
 
 
-def _mlp(inputs: int, outputs: int, gain: float) -> nn.Sequential:
-    layers = [nn.Linear(inputs, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, outputs)]
-    for layer, scale in zip(layers[::2], (np.sqrt(2), np.sqrt(2), gain), strict=True):
-        nn.init.orthogonal_(layer.weight, scale)
-        nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
-
-
 def read_navigator(result: Mapping[str, np.ndarray]) -> Navigator:
     """The navigator in a result of `train_navigator`."""
-    navigator = Navigator()
-    weights = {k.removeprefix("navigator."): torch.tensor(v) for k, v in result.items() if k.startswith("navigator.")}
-    navigator.load_state_dict(weights)
-    return navigator
+    return restored(Navigator(), result, "navigator")
 
 
 class Scouts:
@@ -204,7 +194,7 @@ def train_navigator(
         sigmas.append(navigator.log_std.detach().exp().numpy().copy())
         boosts.append(boost)
         report((i + 1) / updates)
-    return {f"navigator.{k}": v.numpy() for k, v in navigator.state_dict().items()} | {
+    return state_of(navigator, "navigator") | {
         "episodes": np.concatenate(episodes).astype(np.int64),
         "sigma": np.array(sigmas),
         "boost": np.array(boosts),
@@ -238,10 +228,6 @@ def _collect(
             step = errand.step(action.numpy(), boost)
             following = navigator.value(step.following)
         flags = (torch.from_numpy(a) for a in (step.rewards.astype(np.float32), step.terminated, step.ended))
-        steps.append((observation, action, log_prob, value, following, *flags))
+        steps.append(ppo.Step(observation, action, log_prob, value, following, *flags))
         observation = errand.observe(boost) if step.ended.any() else step.following
-    observations, actions, log_probs, values, following, rewards, terminated, ended = (
-        torch.stack(s) for s in zip(*steps, strict=True)
-    )
-    gain = ppo.advantages(rewards, values, following, terminated, ended, config.ppo.gamma, config.ppo.lam)
-    return ppo.Batch(*(t.flatten(0, 1) for t in (observations, actions, log_probs, gain, gain + values)))
+    return ppo.batch_of(steps, config.ppo)

@@ -16,6 +16,7 @@ from lt_lib.settings.profiles import validated
 from lt_lib.settings.velocity import Boost, Exploration, NavigatorConfig, RolloutConfig
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
+from lt_lib.store.states import only
 from lt_lib.velocity.coverage import roll_navigator
 from lt_lib.velocity.navigator import train_navigator
 
@@ -120,7 +121,7 @@ class Transfer:
         The first is a result for every group of rows, the slab always in `blocked`; the second a training by boost.
         """
         swept = [self._roll(self._rollout("no choice", rows=rows, blocked=blocked), navigator) for rows in groups]
-        inputs = {"encoder": self.encoder, "start": _weights_only(navigator)}
+        inputs = {"encoder": self.encoder, "start": only(navigator, "navigator")}
         boosted = [
             Run(train_navigator, self._config("oracle").model_copy(update={"boost": boost}), SEED, inputs)
             for boost in BOOSTS.values()
@@ -134,8 +135,4 @@ class Transfer:
         return self.rollout.model_copy(update=shared | changes)
 
     def _roll(self, config: RolloutConfig, navigator: Result, seed: int = SEED) -> Run:
-        return Run(roll_navigator, config, seed, {"encoder": self.encoder, "navigator": _weights_only(navigator)})
-
-
-def _weights_only(navigator: Result) -> Result:
-    return {name: value for name, value in navigator.items() if name.startswith("navigator.")}
+        return Run(roll_navigator, config, seed, {"encoder": self.encoder, "navigator": only(navigator, "navigator")})

@@ -1,0 +1,27 @@
+"""Modules in results: the entries "<prefix>.<name>" are a module's weights."""
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import nn
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+def state_of(module: nn.Module, prefix: str) -> dict[str, np.ndarray]:
+    """A module's weights as entries of a result."""
+    return {f"{prefix}.{name}": value.detach().cpu().numpy() for name, value in module.state_dict().items()}
+
+
+def restored(module: Module, result: Mapping[str, Any], prefix: str) -> Module:
+    """The module with its weights from a result; other entries do not matter."""
+    state = {name.removeprefix(f"{prefix}."): torch.tensor(value) for name, value in only(result, prefix).items()}
+    module.load_state_dict(state)
+    return module
+
+
+def only(result: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """A result's weights alone, for runs that do not depend on how the training went."""
+    return {name: value for name, value in result.items() if name.startswith(f"{prefix}.")}
