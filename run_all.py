@@ -147,7 +147,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="run_all.py", description="Executes the notebooks in order and says how each went.")
     parser.add_argument("--profile", default="full", help="a file of params/: full (default), quick or smoke")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels")
-    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one a core)")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one per core)")
     parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="a Dask cluster's, tcp://HOST:PORT")
     parser.add_argument("--outputs", type=Path, metavar="DIR", help="default: outputs/<profile>")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="of finished runs; default: outputs/runs")

@@ -1,4 +1,4 @@
-"""What can be known to be wrong with a notebook's parameters before anything is computed."""
+"""Everything that can be wrong with a notebook's parameters, checked before computing."""
 
 import subprocess
 import sys
@@ -54,7 +54,7 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
 
 
 def check_opengl() -> None:
-    """Raises UserError, one line, unless OpenGL opens here; tried in a process of its own, which a driver may end."""
+    """Raises UserError, one line, unless OpenGL opens here; tried in a separate process, which a driver may end."""
     command = [sys.executable, "-m", "lt_lib.envs.opengl"]
     tried = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if tried.returncode:

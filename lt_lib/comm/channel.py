@@ -17,7 +17,7 @@ NEVER = np.iinfo(np.int64).min  # no step at which anything was sent
 
 
 class Channel:
-    """Messages in flight, of many senders side by side, each to one receiver of its own.
+    """Messages in flight from many senders side by side, each to its own receiver.
 
     What is sent at step t arrives at step t + latency, and at no other. The anchor is the sender's position when it
     sent, relative to the receiver on arrival, in communication radii. A sender farther away than the radius is not

@@ -108,7 +108,7 @@ class Team(nn.Module):
 
 
 class TableTeam(Team):
-    """The same functions of the same parameters, each distinct input computed once an update.
+    """The same functions of the same parameters, each distinct input computed once per update.
 
     One sender's attention is 1 or 0, so what the hidden layer adds up is linear in latent, anchor and content: each is
     computed for its own few values, and only their sum for every combination.
@@ -176,16 +176,16 @@ def batch(
 
     A time-out bootstraps from the cell that it ended in.
     """
-    places = np.stack([walks.message, walks.cell, walks.slab], axis=-1).reshape(-1, 3)
-    rows = np.stack(
-        [np.ravel_multi_index(places.T, log_probs.shape[:3]), np.ravel_multi_index(places.T[1:], values.shape)], 1
-    )
+    places = np.stack([walks.message, walks.cell, walks.slab], axis=-1).reshape(-1, 3)  # (t * n, 3)
+    in_policy = np.ravel_multi_index(places.T, log_probs.shape[:3])  # (t * n,) of m * p * slab
+    in_critic = np.ravel_multi_index(places.T[1:], values.shape)  # (t * n,) of p * slab
+    rows = np.stack([in_policy, in_critic], axis=1)  # (t * n, 2)
     cell, slab, following, action, reward, terminated, ended = (
         torch.from_numpy(getattr(walks, name))
         for name in ("cell", "slab", "following", "action", "reward", "terminated", "ended")
     )
-    now, after = values[cell, slab], values[following, slab]
+    now, after = values[cell, slab], values[following, slab]  # (t, n)
     advantage = ppo.advantages(reward, now, after, terminated, ended, config.gamma, config.lam)
-    chosen = log_probs.flatten(0, 2)[torch.from_numpy(rows[:, 0]), action.flatten()]
-    returns = (advantage + now).flatten()
+    chosen = log_probs.flatten(0, 2)[torch.from_numpy(in_policy), action.flatten()]  # (t * n,)
+    returns = (advantage + now).flatten()  # (t * n,)
     return rows, ppo.Batch(torch.from_numpy(places), action.flatten(), chosen, advantage.flatten(), returns)

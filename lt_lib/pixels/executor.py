@@ -129,7 +129,7 @@ def train_executor(
 ) -> dict:
     """Pretrains the controller behind a frozen encoder; returns its weights and learning curves.
 
-    "curve.*" have one entry an update: obedient share of the episodes that ended, their number, entropy.
+    "curve.*" have one entry per update: obedient share of the episodes that ended, their number, entropy.
     """
     rng = np.random.default_rng([seed, 1])
     device = config.device

@@ -147,7 +147,7 @@ class PixelProtocol:
         return self._by_name(runs, "redrawn heads")
 
     def _by_name(self, runs: Mapping[tuple[str, int], Run], what: str) -> dict[str, list[Result]]:
-        """The results of runs named (row, seed): a list of seeds a row."""
+        """The results of runs named (row, seed): a list of seeds per row."""
         results: dict[str, list[Result]] = {}
         for (name, _), result in zip(runs, self.store.fetch(list(runs.values()), what), strict=True):
             results.setdefault(name, []).append(result)

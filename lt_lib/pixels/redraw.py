@@ -1,8 +1,8 @@
-"""The route head trained live, its route drawn anew every k control steps (Section Restoring temporal abstraction).
+"""The route head trained live, its route redrawn every k control steps (Section Restoring temporal abstraction).
 
-Once the route can change on the way, an episode's outcome depends on all of its draws, and the episode bank no longer
-holds: navigator, camera, frozen encoder and frozen executor are stepped while the head learns. With one draw an episode
-(k = 0) it is `route.train_head` again, episode by episode, which is the check on everything here.
+Once the route can change on the way, an episode's outcome depends on all its draws, so the episode bank no longer
+applies: navigator, camera, frozen encoder and frozen executor are stepped while the head learns. With one draw per
+episode (k = 0) it equals `route.train_head`, episode by episode, which is the check on everything here.
 """
 
 from collections.abc import Callable, Mapping
@@ -239,7 +239,7 @@ def train_redrawn_head(
     "head.*"           weights
     "optimal", "entered", "success", "contacts", "length" (episodes,) of the head's sampled choices, in order;
                        optimal when the corridor first entered is the slab-free one
-    "entropy", "draws" (updates,) nats a draw, draws in the batch
+    "entropy", "draws" (updates,) nats per draw, draws in the batch
     """
     rng = np.random.default_rng([seed, 3])  # the scenes and the chance of `train_head` of this seed
     commit_step = scenes["commit_step"]
@@ -268,7 +268,7 @@ def train_redrawn_head(
 
 
 def _improve(head, optimiser, outcome: Outcomes, decisions: Decisions, config: RedrawConfig, rng) -> float:
-    """One PPO update on a batch of episodes; returns the entropy before it, nats a draw.
+    """One PPO update on a batch of episodes; returns the entropy before it, nats per draw.
 
     A minibatch holds as many draws as `config.minibatch` episodes have on average, so that the number of gradient
     steps does not depend on how often the route is drawn.

@@ -1,7 +1,7 @@
 """Stage 2: the route head learns from the team's episode return alone (Sections Route head, Rendered pixels).
 
 The head sees the wire and nothing else, the executor cannot see the wire, so the route has one possible source of
-information. One draw an episode, credited with the whole return; nobody tells the head whether it matched the slab.
+information. One draw per episode, credited with the whole return; nobody tells the head whether it matched the slab.
 """
 
 from collections.abc import Callable, Mapping

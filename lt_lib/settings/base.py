@@ -53,7 +53,7 @@ LAYOUTS = ROOT / "params" / "layouts"
 
 
 def layout_path(name: str) -> Path:
-    """The file of a layout: params/layouts/<name>.yaml, or a path to a yaml file of one's own.
+    """The file of a layout: params/layouts/<name>.yaml, or the path of any yaml file.
 
     Raises UserError for an unknown name.
     """

@@ -41,7 +41,7 @@ class GridConfig(Scene):
     latency: NonNegativeInt = LATENCY  # steps
     steps: PositiveInt = 1_200_000
     envs: PositiveInt = 64
-    rollout: PositiveInt = 512  # steps an environment and update
+    rollout: PositiveInt = 512  # steps per environment and update
     minibatch: PositiveInt = 1_024
     lr: PositiveFloat = 1e-3
     ppo: PpoConfig = PpoConfig()

@@ -53,12 +53,12 @@ class BenchConfig(Settings):
 
 
 class SessionConfig(Scene):
-    """One session: so many placements, a few frames of each."""
+    """One session: a number of placements, a few frames of each."""
 
     layout: str = "matched"
     hazard: PositiveInt = 19  # placements with the slab in the corridor in question
     clear: PositiveInt = 15  # placements with the slab in the other one
-    shots: PositiveInt = 3  # frames a placement
+    shots: PositiveInt = 3  # frames per placement
     frames: NonNegativeInt = 0  # the session ends after so many; 0: after the last placement
     near: PositiveFloat = 120.0  # cm from the camera to the slab's front
     far: PositiveFloat = 250.0  # cm

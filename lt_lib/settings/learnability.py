@@ -23,7 +23,7 @@ class PointMassConfig(Settings):
     optimiser: Literal["adam", "sgd"] = "adam"
     baseline: Literal["batch", "message"] = "batch"  # mean reward of the batch, or of its episodes with this message
     lr: PositiveFloat = 0.02
-    batch: Annotated[int, Field(ge=2)] = 128  # episodes an update
+    batch: Annotated[int, Field(ge=2)] = 128  # episodes per update
     budgets: Annotated[tuple[Budget, ...], Field(min_length=1)] = (
         1_000,
     )  # updates after which success is measured, in order; the last one ends the training

@@ -11,7 +11,7 @@ class ObjectiveConfig(Scene):
     """Stage 1 for any encoder (Section Implementation); loss weights are ours, see ASSUMPTIONS.md."""
 
     frames: PositiveInt = 204_800
-    rollout: Annotated[int, Field(ge=2)] = 32  # frames a rollout
+    rollout: Annotated[int, Field(ge=2)] = 32  # frames per rollout
     epochs: NonNegativeFloat = 2.5
     batch: Annotated[int, Field(ge=2)] = 256
     lr: PositiveFloat = 1e-3

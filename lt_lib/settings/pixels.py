@@ -12,7 +12,7 @@ class ExecutorConfig(Training):
 
     steps: PositiveInt = 1_000_000
     envs: PositiveInt = 64
-    rollout: PositiveInt = 128  # control steps an environment and update
+    rollout: PositiveInt = 128  # control steps per environment and update
     minibatch: PositiveInt = 256
     lr: PositiveFloat = 2.5e-4
     ppo: PpoConfig = PpoConfig()

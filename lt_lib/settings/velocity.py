@@ -36,7 +36,7 @@ class NavigatorConfig(Training):
     boost: Boost = Boost()
     steps: PositiveInt = 655_360  # 80 updates
     envs: PositiveInt = 128
-    rollout: PositiveInt = 64  # control steps an environment and update
+    rollout: PositiveInt = 64  # control steps per environment and update
     minibatch: PositiveInt = 512
     lr: PositiveFloat = 2.5e-4
     ppo: PpoConfig = PpoConfig()
@@ -65,6 +65,6 @@ class RolloutConfig(Training):
     truthful: bool = True  # whether an oracle's message is true or flipped
     rows: Annotated[tuple[Exploration, ...], Field(min_length=1)] = (Exploration(),)
     episodes: PositiveInt = 128  # a row
-    paths: NonNegativeInt = 24  # episodes a row whose path is kept
+    paths: NonNegativeInt = 24  # episodes per row whose path is kept
     horizon: PositiveInt = 600  # control steps
     precision: Precision = "float32"

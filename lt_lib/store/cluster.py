@@ -1,7 +1,7 @@
-"""A Dask cluster as workers: its processes compute a run only if they would compute what we would.
+"""A Dask cluster as workers: a process computes a run only if it would compute what we would.
 
-What a run's result depends on is compared twice: for all workers before any computing, and again by the worker
-for every run, since workers may come later and files may change under them.
+What a result depends on is compared twice: for all workers before computing starts, and by the worker for each run,
+since workers may join later and files may change under them.
 """
 
 import contextlib
@@ -62,7 +62,7 @@ def identity() -> dict[str, str]:
 
 
 def require_same(expected: Mapping[str, str], found: Mapping[str, str], worker: str) -> None:
-    """Raises UserError naming both versions of what a worker has otherwise than we."""
+    """Raises UserError naming both versions where a worker's differs from ours."""
     for name, version in expected.items():
         if found.get(name) != version:
             theirs = f"{name} {found[name]}" if name in found else f"no {name}"
@@ -88,7 +88,7 @@ def connected(address: str) -> Iterator[distributed.Client]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Dask's log holds its tongue: what it would say of a failed connection, our one line says."""
+    """Silences Dask's log: our one line reports a failed connection."""
     logger = logging.getLogger("distributed")
     before = logger.level
     logger.setLevel(logging.CRITICAL)

@@ -43,7 +43,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 def claimed(folder: Path) -> Iterator[None]:
     """Claims a folder for this process while the block runs, and until its death at the latest.
 
-    A file system without locks is told of in a warning, and claimed all the same. Raises UserError naming the process
+    On a file system without locks it warns and goes on. Raises UserError naming the process
     that has it already, and for another user's claim that this one may not read.
     """
     lock, owner = FileLock(folder / ".claimed", timeout=0), folder / ".claimed.by"

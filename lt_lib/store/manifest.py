@@ -1,4 +1,4 @@
-"""What an outputs folder was made with: library versions, commit, machine, seconds a notebook and a stage."""
+"""What an outputs folder was made with: library versions, commit, machine, seconds per notebook and stage."""
 
 import json
 import logging
@@ -40,12 +40,12 @@ def _notebooks_in(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text(encoding="utf-8"))["notebooks"])
     except (ValueError, KeyError, TypeError):
-        logging.getLogger(__name__).warning("%s is damaged: it is written anew", path)
+        logging.getLogger(__name__).warning("%s is damaged: it is rewritten", path)
         return {}
 
 
 def stages_since(journal: Path, position: int) -> dict[str, dict[str, int | float]]:
-    """Runs computed since the journal had so many bytes: {function: {"runs": count, "seconds": of the workers}}."""
+    """Runs computed since the journal was `position` bytes long: {function: {"runs": count, "seconds": of the workers}}."""
     stages: dict[str, dict[str, int | float]] = {}
     if journal.exists():
         for line in journal.read_bytes()[position:].splitlines():

@@ -1,4 +1,4 @@
-"""How far the runs in flight are, told through small files, since each works in a process of its own.
+"""How far the runs in flight are, reported through small files, since each runs in its own process.
 
 `<store>/inflight/<process>/stage.json` tells of one fetch, `<key>.json` beside it of one of its runs.
 """

@@ -27,7 +27,7 @@ class RunError(Exception):
 class RunStore:
     """Finished runs in a folder, `<folder>/<function>/<key>.run`, and the workers that compute missing ones.
 
-    workers: processes at a time on this machine, 0 for one a core; or a Dask scheduler's address, such as
+    workers: processes at a time on this machine, 0 for one per core; or a Dask scheduler's address, such as
     tcp://127.0.0.1:8786, for the workers of its cluster. Each has one thread, so that results do not depend on it.
     """
 
