@@ -45,7 +45,7 @@ def _notebooks_in(path: Path) -> dict[str, Any]:
 
 
 def stages_since(journal: Path, position: int) -> dict[str, dict[str, int | float]]:
-    """Runs computed since the journal was `position` bytes long: {function: {"runs": count, "seconds": of the workers}}."""
+    """Runs computed since the journal was `position` bytes long: {function: {"runs": count, "seconds": workers'}}."""
     stages: dict[str, dict[str, int | float]] = {}
     if journal.exists():
         for line in journal.read_bytes()[position:].splitlines():
