@@ -12,12 +12,12 @@ from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.pixels.episodes import draw_scenes
 from lt_lib.report.claims import load_claims
 from lt_lib.settings.velocity import Boost, Configuration, NavigatorConfig, RolloutConfig
-from lt_lib.velocity import coverage_figures as coverage, transfer_figures as transfer
-from lt_lib.velocity.coverage import Imposed, explore, play, started
+from lt_lib.velocity import judgements
+from lt_lib.velocity.coverage import TABLE_2, WINDOWED, Imposed, explore, play, started
 from lt_lib.velocity.diagnostics import command_error, message_error
 from lt_lib.velocity.navigator import LATERAL, Errand, Navigator, Scouts, annealed, train_navigator
 from lt_lib.velocity.noise import Ar1
-from lt_lib.velocity.transfer import BOOSTS, DIRECT, OTHERS
+from lt_lib.velocity.transfer import BOOSTS, DIRECT
 
 LAYOUT = load_layout("default")
 FOUR_SDS = 4.0  # of a Monte-Carlo estimate
@@ -236,62 +236,77 @@ def test_episodes_can_start_in_front_of_either_mouth_and_share_all_else():
 
 # --- judgements
 def test_the_window_ratio_is_the_paper_s_and_grows_linearly_with_the_boost():
-    assert coverage.window_ratio(560, 40) == load_claims()["cov.window_ratio"].paper
-    assert coverage.window_ratio(560, 40, 3.6) == pytest.approx(14 * 3.6)
-    with pytest.raises(ValueError, match="window_ratio"):
-        coverage.window_ratio(560, 0)
+    ratio = judgements.window_ratio(RolloutConfig(), BOOSTS["annealed"])
+    assert ratio == load_claims()["cov.window_ratio"].paper
+    assert judgements.window_ratio(RolloutConfig(), BOOSTS["annealed"], 3.6) == pytest.approx(ratio * 3.6)
+    for window, factor in ((0, 1.0), (40, 0.0)):
+        with pytest.raises(ValueError, match="window_ratio"):
+            judgements.window_ratio(RolloutConfig(), Boost(window=window), factor)
+
+
+@pytest.mark.parametrize(("horizon", "window", "ratio"), [(300, 40, 6.5), (600, 60, 9.0), (40, 40, 0.0), (12, 40, 0.0)])
+def test_the_window_ratio_follows_the_settings_in_use(horizon, window, ratio):
+    assert judgements.window_ratio(RolloutConfig(horizon=horizon), Boost(window=window)) == ratio
+
+
+def test_the_windowed_row_and_the_boosts_share_one_window():
+    assert {WINDOWED["cov.window_ar"].window} == {boost.window for boost in BOOSTS.values()}
 
 
 def test_opposition_enumerates_every_order_ties_included():
-    rows = [coverage.Row(128, c, s, 0) for c, s in ((0, 90), (0, 80), (3, 80), (9, 20), (8, 30), (20, 10))]
-    rho, p = coverage.opposition(rows)
-    x, y = np.array([row.shares for row in rows]).T
+    x, y = np.array([(0, 90), (0, 80), (3, 80), (9, 20), (8, 30), (20, 10)]).T / 128
+    rho, p = judgements.opposition(x, y)
     assert rho == pytest.approx(spearmanr(x, y).statistic)
     rng = np.random.default_rng(0)
     shuffled = np.mean([spearmanr(x, rng.permutation(y)).statistic <= rho + 1e-9 for _ in range(400)])
     assert abs(p - shuffled) < 0.03
-    straight = [coverage.Row(128, i, 128 - i, 0) for i in range(7)]
-    assert coverage.opposition(straight) == (pytest.approx(-1), pytest.approx(1 / 5040))
-    assert coverage.opposition([coverage.Row(9, 0, 5, 5)] * 7) == (0.0, 1.0)
+    straight = np.arange(7) / 128
+    assert judgements.opposition(straight, 1 - straight) == (pytest.approx(-1), pytest.approx(1 / 5040))
+    assert judgements.opposition(np.zeros(7), straight) == (0.0, 1.0)
 
 
 def test_rows_count_coverage_success_and_success_off_the_alternative():
     entered = np.zeros((1, 4, 2), bool)
     entered[0, :, 1] = [True, True, False, False]
     swept = {"entered": entered, "success": np.array([[True, False, True, False]])}
-    assert coverage.rows(swept, alternative=1) == [coverage.Row(4, 2, 2, 1)]
-    assert coverage.rows(swept, alternative=1)[0].competence == 0.5
-    assert coverage.rows(swept, alternative=0)[0].shares == (0.0, 0.5)
+    assert judgements.count_rows(swept, alternative=1) == [judgements.Row(4, 2, 2, 1)]
+    assert judgements.count_rows(swept, alternative=1)[0].competence == 0.5
+    assert judgements.count_rows(swept, alternative=0)[0].shares == (0.0, 0.5)
 
 
 def test_alternative_success_counts_blocked_incumbents_between_the_edges():
     rng = np.random.default_rng(0)
     episodes = np.column_stack([rng.integers(0, 20, 300), *rng.integers(0, 2, (3, 300))])
     result, edges = {"episodes": episodes, "boost": np.ones(20)}, (0, 7, 14)
-    for (low, high), (succeeded, n) in zip(
-        ((0, 7), (7, 14)), coverage.alternative_success(result, 1, edges), strict=True
-    ):
+    counts = judgements.alternative_success(result, 1, edges)
+    for low, high, (succeeded, n) in zip(edges[:-1], edges[1:], counts, strict=True):
         kept = [e for e in episodes if low <= e[0] < high and e[1] == 1]
         assert (succeeded, n) == (sum(e[3] for e in kept), len(kept))
+
+
+def test_the_success_range_ignores_intervals_without_episodes():
+    assert judgements.success_range(np.array([[1, 4], [0, 0], [3, 4]])) == (0.25, 0.75)
+    assert judgements.success_range(np.zeros((2, 2), np.int64)) == (0.0, 0.0)
 
 
 def test_the_held_command_is_sideways_travel_over_full_command():
     t = np.arange(0, 40, 4)
     path = np.stack([0 * t, -0.02 * t], axis=1)[None]  # 0.02 m a step to the right, whatever happens forward
     result = {"path": np.stack([path, path])}
-    assert transfer.held_command(result, step=0.05, window=30) == pytest.approx(0.4)
-    assert transfer.held_command(result, step=0.05, window=600) == pytest.approx(0.4)  # the path's end at the latest
+    assert judgements.held_command(result, step=0.05, window=30) == pytest.approx(0.4)
+    assert judgements.held_command(result, step=0.05, window=600) == pytest.approx(0.4)  # the path's end at the latest
 
 
 def test_entering_no_corridor_is_neither_optimal_nor_commitment():
     result = {"first": np.array([[0, 0, -1, 0]]), "slab": np.array([[0, 1, 1, 0]])}
-    assert transfer.optimal(result).tolist() == [False, True, False, False]
-    assert transfer.commitment(result) == (0, 0.5)
+    assert judgements.optimal(result).tolist() == [False, True, False, False]
+    assert judgements.commitment(result) == (0, 0.5)
+    assert not judgements.has_committed(result)
+    assert judgements.has_committed({"first": np.zeros((1, 4)), "slab": result["slab"]})
 
 
 def test_settings_are_the_paper_s():
     claims = load_claims()
     assert RolloutConfig().episodes == claims["cov.episodes"].paper
     assert tuple(DIRECT) == Configuration.__args__ and len(DIRECT) == claims["port.null"].n
-    assert set(transfer.COLOURS) == {*DIRECT, *OTHERS}
-    assert set(coverage.TABLE) | set(coverage.WINDOWED) <= set(claims)
+    assert {*TABLE_2, *WINDOWED} <= set(claims)

@@ -15,7 +15,7 @@ from lt_lib.settings.hardware import MatchedEncoderConfig, SessionsConfig
 from lt_lib.settings.pixels import PixelsConfig
 from lt_lib.settings.profiles import load_profile, notebook_names, validated
 from lt_lib.settings.velocity import NavigatorConfig, RolloutConfig
-from lt_lib.velocity.transfer import Transfer as DirectTransfer
+from lt_lib.velocity.transfer import DirectTransfer
 from run_all import code_cells
 
 PROFILES = ("full", "quick")

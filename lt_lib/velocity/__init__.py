@@ -1,1 +1,1 @@
-"""From grid actions to velocity commands: navigators without a route, and what their exploration reaches."""
+"""From grid actions to velocity commands: navigators without a route head, and what their exploration reaches."""

@@ -1,6 +1,7 @@
-"""What exploration reaches: a frozen navigator under imposed noise, no learning (Section Exploration coverage)."""
+"""Exploration coverage: a frozen navigator under imposed lateral noise, without learning (Table II)."""
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -14,38 +15,55 @@ from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, FrozenEncoder
 from lt_lib.pixels.episodes import SLABS, draw_scenes
 from lt_lib.settings.base import LATENCY
-from lt_lib.settings.velocity import RolloutConfig
+from lt_lib.settings.velocity import Boost, Exploration, RolloutConfig
 from lt_lib.velocity.navigator import LATERAL, Navigator, Scouts, read_navigator
 from lt_lib.velocity.noise import Ar1
 
-APPROACH = 40  # control steps before the mouths: where the bit's effect on the lateral mean is measured
-EVERY = 4  # control steps between the kept points of a path
+APPROACH = 40  # control steps before the mouths, over which the bit's effect on the lateral mean is measured
+EVERY = 4  # control steps between the recorded points of a path
+# The rows of Table II by claim: lateral sigma in units of full command, correlation time in control steps
+TABLE_2: Mapping[str, Exploration] = MappingProxyType(
+    {
+        "cov.s055_t0": Exploration(sigma=0.55),
+        "cov.s055_t30": Exploration(sigma=0.55, tau=30.0),
+        "cov.s100_t0": Exploration(sigma=1.0),
+        "cov.s100_t30": Exploration(sigma=1.0, tau=30.0),
+        "cov.s100_t100": Exploration(sigma=1.0, tau=100.0),
+        "cov.s165_t30": Exploration(sigma=1.65, tau=30.0),
+        "cov.s165_t100": Exploration(sigma=1.65, tau=100.0),
+    }
+)
+# Section Effect of increased exploration noise: one process, confined to the window of the boost or not
+WINDOWED: Mapping[str, Exploration] = MappingProxyType(
+    {
+        "cov.window_ar": Exploration(sigma=1.65, tau=30.0, window=Boost().window),
+        "cov.episode_ar": Exploration(sigma=1.65, tau=30.0),
+    }
+)
 
 
 class Episodes(NamedTuple):
-    """What became of E episodes."""
+    """The outcomes of E episodes."""
 
     success: Bool[np.ndarray, " e"]  # the goal was reached within the horizon
     length: Int[np.ndarray, " e"]  # control steps
     contacts: Int[np.ndarray, " e"]  # control steps in contact with the slab
-    first: Int[np.ndarray, " e"]  # the first corridor entered: 0 left, 1 right, -1 none
-    entered: Bool[np.ndarray, "e 2"]  # whether the left and the right corridor was entered at any time
-    shift: Float[np.ndarray, "e 2"]  # |change of the lateral mean| if the oracle's bit flips, policy sds: approach, all
-    path: Float[np.ndarray, "e t 2"]  # metres, every fourth control step, NaN after the end
+    first: Int[np.ndarray, " e"]  # first corridor entered: 0 left, 1 right, -1 none
+    entered: Bool[np.ndarray, "e 2"]  # whether the left and the right corridor were ever entered
+    shift: Float[np.ndarray, "e 2"]  # |change of the lateral mean| when the bit flips, policy sds: approach, all
+    path: Float[np.ndarray, "e t 2"]  # metres, at every fourth control step, NaN after the end
 
 
 class Imposed(NamedTuple):
-    """The exploration of each episode, (E,): lateral AR(1) noise in its first `window` steps, the policy's own else.
+    """The exploration of E episodes: lateral AR(1) noise in the first `window` steps, otherwise the policy's own."""
 
-    own  factor on the policy's own noise; 0 is deterministic
-    """
-
-    sigma: Float[np.ndarray, " e"]
-    tau: Float[np.ndarray, " e"]
-    window: Int[np.ndarray, " e"]
-    own: Float[np.ndarray, " e"]
+    sigma: Float[np.ndarray, " e"]  # stationary standard deviation, units of full command
+    tau: Float[np.ndarray, " e"]  # correlation time, control steps
+    window: Int[np.ndarray, " e"]  # control steps
+    own: Float[np.ndarray, " e"]  # factor on the policy's own noise; 0 is deterministic
 
     def take(self, live: Bool[np.ndarray, " e"]) -> "Imposed":
+        """The same for the live episodes only."""
         return Imposed(*(values[live] for values in self))
 
 
@@ -57,8 +75,8 @@ def explore(
     age: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "b 3"]:
-    """Actions before clipping; `chain` (B,) is the unit AR(1) noise of this step."""
-    noise = rng.standard_normal(mean.shape) * own_std.numpy() * imposed.own[:, None]
+    """Actions before clipping; `chain` is the unit AR(1) noise of this step, `age` the control steps taken so far."""
+    noise = rng.standard_normal(mean.shape) * own_std.numpy() * imposed.own[:, None]  # (b, 3)
     noise[:, LATERAL] = np.where(age < imposed.window, imposed.sigma * chain, noise[:, LATERAL])
     return mean.numpy() + noise
 
@@ -77,9 +95,12 @@ def play(
     latency: int = LATENCY,
     report: Callable[[float], None] = lambda _: None,
 ) -> Episodes:
-    """Drives E episodes side by side, each from a fresh draw of the scene to the goal or the time-out.
+    """Plays E episodes side by side, each from its own draw of the scene to the goal or the time-out.
 
-    slab, told  (E,) 0 left, 1 right: the blocked corridor, and what an oracle's message says it is
+    slab     (E,) blocked corridor, 0 left, 1 right
+    told     (E,) blocked corridor according to the oracle's message
+    horizon  time-out in control steps
+    report   is called with the share done
     """
     n = len(slab)
     arena, camera = Arena(layout, n), FastCamera(layout)
@@ -92,10 +113,10 @@ def play(
     std = navigator.log_std.exp()
     for age in range(horizon):
         ages = np.full(n, age)
-        latent = encoder.latent(camera.frames(arena.pose[live], slab[live], arena.scout[live, :2])).cpu()
-        mean = navigator.mean(latent, scouts.wires(arena, ages)[live])
+        latent = encoder.latent(camera.frames(arena.pose[live], slab[live], arena.scout[live, :2])).cpu()  # (b, 64)
+        mean = navigator.mean(latent, scouts.wires(arena, ages)[live])  # (b, 3)
         other = navigator.mean(latent, liars.wires(arena, ages)[live])
-        shift = ((other - mean)[:, LATERAL].abs() / std[LATERAL]).numpy()
+        shift = ((other - mean)[:, LATERAL].abs() / std[LATERAL]).numpy()  # (b,)
         done.shift[live] += np.column_stack([shift * (age < APPROACH), shift])
         chain = chains.step(ages == 0)[live]
         action = np.zeros((n, ACTION))
@@ -124,7 +145,7 @@ def _blank(n: int, horizon: int) -> Episodes:
 
 
 def _record(done: Episodes, arena: Arena, live: Bool[np.ndarray, " e"], age: int) -> Bool[np.ndarray, " e"]:
-    """Notes what the latest step did to the live episodes; returns which are still live."""
+    """Records the outcome of the latest step in `done`; returns which episodes are still live."""
     done.contacts[live] += arena.contact[live]
     for side in range(len(SIDES)):
         done.entered[:, side] |= live & (arena.corridor == side)
@@ -136,7 +157,7 @@ def _record(done: Episodes, arena: Arena, live: Bool[np.ndarray, " e"], age: int
 
 
 def started(layout: Layout, start: str) -> Layout:
-    """The layout with its spawn moved in front of the 'left' or 'right' corridor's mouth, or as it is for 'spawn'."""
+    """The layout with its spawn moved in front of the 'left' or 'right' corridor's mouth; unchanged for 'spawn'."""
     if start == "spawn":
         return layout
     place = layout.choice_points[SIDES.index(start)].model_dump()
@@ -151,9 +172,10 @@ def roll_navigator(
     encoder: Mapping[str, np.ndarray],
     navigator: Mapping[str, np.ndarray],
 ) -> dict:
-    """Episodes of a frozen navigator under every row of the settings; arrays (rows, episodes, ...) as in `Episodes`.
+    """Plays a frozen navigator under each row of the settings.
 
-    "slab" (rows, episodes) is the blocked corridor; "path" is kept for the first `config.paths` episodes of a row.
+    Returns the arrays of `Episodes`, each (rows, episodes, ...), and "slab" (rows, episodes), the blocked corridor
+    (0 left, 1 right). "path" has only the first `config.paths` episodes of each row.
     """
     rng = np.random.default_rng([seed, 7])
     shape = (len(config.rows), config.episodes)

@@ -1,4 +1,7 @@
-"""The standard diagnostics of a navigator that ignores its message: all is well (Section From Grid Actions)."""
+"""The standard diagnostics for a navigator that ignores its message (Section From Grid Actions to Velocity Commands).
+
+They test perception, channel and controller; in the paper they find no fault in any of the three.
+"""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,11 +16,14 @@ from lt_lib.pixels.episodes import draw_scenes
 from lt_lib.settings.base import LATENCY
 from lt_lib.velocity.navigator import Scouts
 
-SETTLED = 2  # control steps after which a new command's velocity is reached
+SETTLED = 2  # control steps after which a newly commanded velocity is reached
 
 
 def probe_accuracy(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator) -> float:
-    """Accuracy of a linear probe of the blocked corridor on the scout's latent, on the half not fitted to."""
+    """Held-out accuracy of a linear probe that reads the blocked corridor off the scout's latent.
+
+    draws  of the scene; the probe is fitted to the first half and scored on the second
+    """
     slab, scenes = rng.integers(0, len(SIDES), draws), draw_scenes(layout, draws, rng)
     latents = encoder.latent(FastCamera(layout).frames(scenes.scout, slab, scenes.spawn[:, :2])).cpu().numpy()
     half = draws // 2
@@ -28,7 +34,7 @@ def probe_accuracy(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.r
 def message_error(
     layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator, latency: int = LATENCY
 ) -> float:
-    """Largest difference between any float that the scout sent and the one that arrives after the latency."""
+    """Largest difference, over all floats, between what the scout sends and what arrives after the latency."""
     slab, scenes, everyone = rng.integers(0, len(SIDES), draws), draw_scenes(layout, draws, rng), np.ones(draws, bool)
     arena, scouts = Arena(layout, draws), Scouts(layout, encoder, "latent", draws, latency)
     arena.reset(everyone, scenes.spawn, slab, scenes.scout)
@@ -41,16 +47,16 @@ def message_error(
 
 
 def command_error(layout: Layout, draws: int, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """Largest difference between commanded and reached body velocity from the spawn, as a share of full speed."""
+    """Largest difference per axis between commanded and reached body velocity from the spawn, in full speeds."""
     arena, scenes = Arena(layout, draws), draw_scenes(layout, draws, rng)
     arena.reset(np.ones(draws, bool), scenes.spawn, np.zeros(draws, np.int64), scenes.scout)
     command = rng.uniform(-1, 1, (draws, ACTION))
-    command[:, -1] = 0.0  # without turning, a body velocity is one straight line
+    command[:, -1] = 0.0  # without turning, the robot moves on a straight line
     for _ in range(SETTLED):
         arena.step(command)
     before = arena.pose
     arena.step(command)
-    moved, heading = (arena.pose - before) * CONTROL_HZ, before[:, 2]
+    moved, heading = (arena.pose - before) * CONTROL_HZ, before[:, 2]  # (b, 3), (b,)
     forward = np.cos(heading) * moved[:, 0] + np.sin(heading) * moved[:, 1]
     across = -np.sin(heading) * moved[:, 0] + np.cos(heading) * moved[:, 1]
     reached = np.column_stack([forward / V_MAX, across / V_MAX, moved[:, 2] / W_MAX])

@@ -1,6 +1,6 @@
-"""Direct transfer to velocity control, and what exploration reaches (Sections From Grid Actions, Exploration coverage).
+"""Direct transfer to velocity control: the runs of the study (Section From Grid Actions to Velocity Commands).
 
-What notebook 5 asks the run store for. Every navigator is trained with the same settings but for what its name says.
+Notebook 5 fetches them from here. All navigators share one set of settings and differ only in what their names say.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from lt_lib.velocity.coverage import roll_navigator
 from lt_lib.velocity.navigator import train_navigator
 
 SEED = 0
-# The paper's six configurations vary hazard penalty, discount, spawn curriculum and layout; what each differs in
+# What each of the six configurations changes; like the paper's, they vary hazard penalty, discount, curriculum, layout
 DIRECT: Mapping[str, dict[str, Any]] = MappingProxyType(
     {
         "base": {},
@@ -32,7 +32,7 @@ DIRECT: Mapping[str, dict[str, Any]] = MappingProxyType(
         "wide layout": {"layout": "wide"},
     }
 )
-# Beside them: the bit itself, no message, and the choice or the missing coverage removed by hand
+# The controls: the bit itself, no message, no choice of corridor, and the missing coverage supplied by hand
 OTHERS: Mapping[str, dict[str, Any]] = MappingProxyType(
     {
         "oracle": {"content": "oracle"},
@@ -41,8 +41,8 @@ OTHERS: Mapping[str, dict[str, Any]] = MappingProxyType(
         "shown both mouths": {"content": "oracle", "starts": "anywhere"},
     }
 )
-# The paper's boost is still 3.6 times the policy's own noise at iteration 80: a straight line that would end at 1
-# after twice as many. Held, it tells suppression from decay, which one annealed run cannot
+# The paper's boost is still 3.6 times the policy's own noise at iteration 80: a straight line that would reach 1 after
+# 160. A boost that is held can distinguish suppression from decay; one annealed run cannot
 BOOSTS = MappingProxyType(
     {
         "annealed": Boost(first=6.2, last=3.6, at=80),
@@ -50,20 +50,21 @@ BOOSTS = MappingProxyType(
         "none": Boost(),
     }
 )
+EARLY, LATE = (0, 14, 28), (66, 73, 80)  # edges of the iterations over which the paper's two ranges are measured
 SAMPLED, GREEDY = Exploration(window=0), Exploration(window=0, own=0.0)
 
 
 class Examined(NamedTuple):
-    """Episodes of the frozen navigators, lists over trainings."""
+    """Episodes of the frozen navigators, one result per training in each list."""
 
-    spawn: dict[str, list[Result]]  # slab at random; two rows, as it explores and without noise
-    mouths: dict[str, list[list[Result]]]  # as it explores, from in front of the left and of the right, that one free
-    flips: dict[tuple[str, bool], list[Result]]  # without noise, by blocked corridor and whether told the truth
+    spawn: dict[str, list[Result]]  # from the spawn, slab at random; row 0 actions sampled, row 1 without noise
+    mouths: dict[str, list[list[Result]]]  # from in front of the left and the right mouth, that corridor free
+    flips: dict[tuple[str, bool], list[Result]]  # the oracle's, without noise, by blocked corridor and truth of the bit
 
 
 @dataclass(frozen=True)
-class Transfer:
-    """The navigators at one size, behind one frozen encoder."""
+class DirectTransfer:
+    """The study at one size: navigators trained and examined behind one frozen encoder."""
 
     store: RunStore
     encoder: Result
@@ -71,14 +72,19 @@ class Transfer:
     rollout: RolloutConfig
 
     @classmethod
-    def of(cls, protocol: PixelProtocol, navigator: Mapping[str, Any], rollout: Mapping[str, Any]) -> "Transfer":
-        """From a notebook's parameters; the dicts are those of `settings.profiles.SECTIONS`. Raises GateError."""
+    def of(cls, protocol: PixelProtocol, navigator: Mapping[str, Any], rollout: Mapping[str, Any]) -> "DirectTransfer":
+        """Builds the study from a notebook's parameters.
+
+        navigator, rollout  dicts of the fields of NavigatorConfig and RolloutConfig, as in a profile
+
+        Raises GateError if the encoder fails its freeze gates.
+        """
         given = validated(NavigatorConfig, "navigator", navigator), validated(RolloutConfig, "rollout", rollout)
         shared = {name: getattr(protocol.sizes.head, name) for name in ("layout", "device", "latency")}
         return cls(protocol.store, protocol.frozen_encoder(), *(everywhere(each, shared) for each in given))
 
     def navigators(self, configurations: Sequence[str], oracle_seeds: int) -> dict[str, list[Result]]:
-        """All navigators trained from scratch, by name: one of each, `oracle_seeds` of those that are told the bit."""
+        """Trains all navigators from scratch; returns them by name: `oracle_seeds` of the oracle, one of each other."""
         runs = {
             (name, seed): Run(train_navigator, self._config(name), seed, {"encoder": self.encoder})
             for name in (*configurations, *OTHERS)
@@ -92,9 +98,9 @@ class Transfer:
         return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | changes))
 
     def examined(self, navigators: Mapping[str, list[Result]]) -> Examined:
-        """The navigators frozen: from the spawn, from in front of either mouth, and with the oracle's bit flipped.
+        """Plays the frozen navigators from the spawn, from in front of either mouth, and with the oracle's bit flipped.
 
-        Every navigator meets draws of its own from the spawn, and one and the same draws in all cases of the bit.
+        From the spawn, each navigator gets its own random draws of the scene; in all other cases all get the same.
         """
         everyone = [(name, navigator) for name, results in navigators.items() for navigator in results]
         spawn = [self._roll(self._rollout(n, rows=(SAMPLED, GREEDY)), r, seed) for seed, (n, r) in enumerate(everyone)]
@@ -116,9 +122,13 @@ class Transfer:
     def explored(
         self, navigator: Result, blocked: str, groups: Sequence[tuple[Exploration, ...]]
     ) -> tuple[list[Result], dict[str, Result]]:
-        """What becomes of a navigator without a message: frozen under imposed noise, and trained on with the bit.
+        """Sweeps a navigator that was trained without a message, and trains it further with the bit.
 
-        The first is a result for every group of rows, the slab always in `blocked`; the second a training by boost.
+        navigator  a result of `train_navigator`
+        blocked    the slab's corridor throughout the sweep
+        groups     rows of the sweep, one run per group
+
+        Returns one result of `roll_navigator` per group, and the further trainings by the name of their boost.
         """
         swept = [self._roll(self._rollout("no choice", rows=rows, blocked=blocked), navigator) for rows in groups]
         inputs = {"encoder": self.encoder, "start": only(navigator, "navigator")}
