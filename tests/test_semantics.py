@@ -114,7 +114,10 @@ def test_the_gates_are_measured_on_frames_that_nothing_was_trained_on(weights, m
         monkeypatch.setattr(module, "random_rollouts", recorded)
     monkeypatch.setattr(jepa, "fit", lambda *_: {})
     jepa.train_encoder(EncoderConfig(frames=160, rollout=8), 0, report=quiet)
-    gates.measure_gates(GateConfig(rollouts=20, length=8, shown=20), 0, report=quiet, encoder=weights)
+    seen = np.arange(160).reshape(20, 8) % 2 == 0
+    monkeypatch.setattr(gates, "hazard_visible", lambda _: seen)
+    monkeypatch.setattr(gates, "_picture", lambda *_: {})
+    gates.measure_gates(GateConfig(rollouts=20, length=8), 0, report=quiet, encoder=weights)
     training, held_out = (drawn[module.__name__].poses for module in (jepa, gates))
     assert training.shape == held_out.shape  # of one generator they would be the same
     assert not np.isclose(training, held_out).all(axis=-1).any()
