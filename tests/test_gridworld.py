@@ -14,7 +14,7 @@ from lt_lib import ppo
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.receiver import Receiver
 from lt_lib.envs.layout import load_layout
-from lt_lib.gridworld import corruption as grid_corruption, table_ppo
+from lt_lib.gridworld import judgements, table_ppo
 from lt_lib.gridworld.episodes import evaluate_grid, rerouted
 from lt_lib.gridworld.map import GOAL_REWARD, HAZARD, HORIZON, PATCH, SLAB_REWARD, STEP_REWARD, WALL, Grid
 from lt_lib.gridworld.mappo import Actor, Inputs, TableTeam, Team, batch, train_grid
@@ -442,16 +442,16 @@ def trained(success: float) -> dict:
 
 
 def test_who_falls_who_peeks_and_who_must_not_change_are_told_apart():
-    reads = played({"intact": 1.0} | dict.fromkeys(grid_corruption.DESTROYED, 0.4))
+    reads = played({"intact": 1.0} | dict.fromkeys(judgements.DESTROYED, 0.4))
     peeks, deaf = played({"intact": 1.0}, rerouted=0.5), played({"intact": 0.5})
     policies = {"latent": [trained(1.0)] * 2, "raw": [trained(1.0)], "floor": [trained(0.5)]}
-    judged = grid_corruption.judge(policies, {"latent": [reads, reads], "raw": [peeks], "floor": [deaf]})
+    judged = judgements.judge_corrupted(policies, {"latent": [reads, reads], "raw": [peeks], "floor": [deaf]})
     assert judged["grid.corrupt"]["value"] == "2 of 3" and judged["grid.peek"]["value"] == 1
     assert judged["grid.invariant"]["value"] == "all" and judged["grid.invariant"]["n"] == 1
     moved = played({"intact": 0.5, "wire_zeroed": 0.8})
-    judged = grid_corruption.judge(policies, {"latent": [reads, reads], "raw": [peeks], "floor": [moved]})
+    judged = judgements.judge_corrupted(policies, {"latent": [reads, reads], "raw": [peeks], "floor": [moved]})
     assert judged["grid.invariant"]["value"] == "not all" and not judged["grid.invariant"]["holds"]
-    assert "grid.corrupt" not in grid_corruption.judge({"floor": [trained(0.5)]}, {"floor": [deaf]})
+    assert "grid.corrupt" not in judgements.judge_corrupted({"floor": [trained(0.5)]}, {"floor": [deaf]})
 
 
 def test_an_unknown_setting_inside_a_section_is_named_with_its_neighbours():

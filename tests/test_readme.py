@@ -83,19 +83,33 @@ assert train("signs")["optimal"][-500:].mean() > 0.9
 """,
     "condition": TRAIN
     + """
-from lt_lib.settings.profiles import load_profile
+import json
+from types import SimpleNamespace
 from lt_lib.preflight import check_inputs
-from lt_lib.pixels import figures as pixels
-from lt_lib.report.claims import load_claims
+from lt_lib.report.claims import Findings
+from lt_lib.settings.pixels import PixelsConfig
+from lt_lib.settings.profiles import load_profile
 seeds = load_profile("full")["04_pixels"]["seeds"]
 assert seeds["shuffled"] == 5
 check_inputs({"seeds": seeds})
 row = CONDITIONS["shuffled"]
-heads = {"shuffled": [train(row.content, row.wire)] * 2, "latent": [train("latent")] * 2}
-table = pixels.table(heads, load_claims())
-assert table["route opt."].astype(str).str[:5].astype(float).between([0.3, 0.9], [0.7, 1]).all(), table
+trained = {"shuffled": [train(row.content, row.wire)] * 2, "latent": [train("latent")] * 2}
+# the notebook's own cells, from its imports to its table, with these heads
+cells = {cell["id"]: "".join(cell["source"]) for cell in json.load(open("notebooks/04_pixels.ipynb"))["cells"]}
+imports = cells["c02"][: cells["c02"].index("require_opengl()")]
+there = {
+    "protocol": SimpleNamespace(trained_heads=lambda *_: trained, sizes=PixelsConfig()),
+    "seeds": seeds, "episodes": None, "frozen_encoder": None, "profile": "smoke",
+    "folder": Path("outputs/smoke"), "findings": Findings("04_pixels", Path("outputs/smoke"), "smoke"),
+}
+for code in (imports, cells["c12a"], cells["c12"]):
+    exec(code, there)
+*lines, last = cells["c13"].strip().splitlines()
+exec("\\n".join([*lines, f"table = {last}"]), there)
+table = there["table"]
+assert table["route opt."].str[:5].astype(float).between([0.3, 0.9], [0.7, 1]).all(), table
 assert list(table["route opt., paper"] == "") == [True, False]
-pixels.routes(heads, load_claims())
+assert Path("outputs/smoke/figures/04_routes.png").exists()
 """,
     "layout": """
 import numpy as np

@@ -16,8 +16,8 @@ from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.pixels import episodes, redraw
 from lt_lib.pixels.episodes import Outcomes, draw_scenes, drive, roll_bank
 from lt_lib.pixels.executor import Executor, FrozenExecutor
+from lt_lib.pixels.judgements import fall_test
 from lt_lib.pixels.redraw import CREDITS, REDRAWS, Decisions, LiveArena, draws_per_episode, train_redrawn_head
-from lt_lib.pixels.redraw_figures import fall_test
 from lt_lib.pixels.route import train_head
 from lt_lib.settings.base import layout_path
 from lt_lib.settings.pixels import BankConfig, HeadConfig, RedrawConfig

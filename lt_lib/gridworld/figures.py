@@ -13,9 +13,9 @@ from matplotlib.patches import Patch, Rectangle
 from lt_lib.comm.messages import CONDITIONS
 from lt_lib.envs.layout import SIDES
 from lt_lib.gridworld.map import CELL, FREE, GOAL, HAZARD, RADIUS, UNKNOWN, WALL, Grid
-from lt_lib.pixels.figures import SOLVED, final_shares
 from lt_lib.report.claims import Claim
 from lt_lib.report.scene import NAVIGATOR, SCOUT
+from lt_lib.report.shares import SOLVED, final_shares
 from lt_lib.report.style import ROLES, chance_line
 from lt_lib.store.run import Result
 

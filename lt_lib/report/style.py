@@ -1,6 +1,7 @@
 """What all figures share: colours by role, the stamp of a size that gives no results, and where they are kept."""
 
 from pathlib import Path
+from textwrap import fill
 
 from IPython.display import Image
 from matplotlib.axes import Axes
@@ -19,6 +20,11 @@ DPI = 130
 
 def chance_line(axes: Axes, level: float = 0.5) -> None:
     axes.axhline(level, label="chance", **CHANCE)
+
+
+def wrapped(words: str) -> str:
+    """A tick's words in lines that do not reach the next tick's."""
+    return fill(words, 15, break_long_words=False)
 
 
 def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str) -> Image:
