@@ -17,6 +17,7 @@ SHARED = {"settings": 0, "store": 1, "envs": 2, "perception": 3, "comm": 4, "ppo
 FLOORS = SHARED | dict.fromkeys(STUDIES, 6)
 LONGEST_CELL = 36
 LONGEST_FUNCTION = 60
+SMALL_FUNCTION = 6  # lines, in a notebook
 LONGEST_FULL_RUN_S = 2 * 3600
 TRAIN_OR_EVALUATE = {name for name in notebook_names() if "02" <= name[:2] <= "08"}
 FOLDER = re.compile(r"(?:^|[\s'\"(=])(/(?:home|root|tmp|usr|work|Users)/[^\s'\"]*)")
@@ -67,7 +68,9 @@ def test_source_notebooks_are_short_cells_of_calls_without_outputs(name):
         lines = "".join(cell["source"]).splitlines()
         assert not cell["outputs"] and cell["execution_count"] is None
         assert len(lines) <= LONGEST_CELL
-        assert not any(line.startswith(("def ", "class ")) for line in lines)
+        for node in ast.parse("\n".join(lines)).body:
+            assert not isinstance(node, ast.ClassDef)
+            assert not isinstance(node, ast.FunctionDef) or node.end_lineno - node.lineno < SMALL_FUNCTION
 
 
 @pytest.mark.parametrize("path", sorted(FULL.glob("notebooks/*.ipynb")), ids=lambda path: path.stem)
