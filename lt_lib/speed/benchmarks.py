@@ -118,7 +118,7 @@ def bank_against_live(
     }
     seconds = taking_turns(calls, 1)
     return BankCost(
-        seconds["bank"] * protocol.sizes.bank.entries * protocol.shards / episodes,
+        seconds["bank"] * protocol.sizes.bank.entries * protocol.sizes.shards / episodes,
         seconds["head"],
         seconds["live"] * protocol.sizes.head.episodes / episodes,
     )
