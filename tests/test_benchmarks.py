@@ -1,4 +1,4 @@
-"""What notebook 10 measures with: turns, growth, profiles."""
+"""The instruments of notebook 10: turns, the power law of a cost, profiles."""
 
 import time
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from lt_lib.speed import benchmarks
-from lt_lib.speed.turns import taking_turns
+from lt_lib.speed.benchmarks import BankCost
+from lt_lib.speed.turns import power_law, profile_call, taking_turns
 
 
 def test_turns_alternate_and_the_first_round_is_not_counted():
@@ -29,20 +29,18 @@ def test_all_sides_are_timed_with_one_thread_as_in_a_worker():
     threads = set()
     torch.set_num_threads(2)
     taking_turns({"a": lambda: threads.add(torch.get_num_threads())}, 1)
-    benchmarks.profile(lambda: threads.add(torch.get_num_threads()), 1)
+    profile_call(lambda: threads.add(torch.get_num_threads()), 1)
     assert threads == {1} and torch.get_num_threads() == 2
     torch.set_num_threads(before)
 
 
-def test_growth_finds_the_exponent_of_a_power_law(monkeypatch):
-    monkeypatch.setattr(benchmarks, "taking_turns", lambda calls, rounds: {n: 3e-4 * n**1.5 for n in calls})
-    found = benchmarks.growth("things", dict.fromkeys((1, 4, 16, 64), _busy), 1)
-    assert found.slope == pytest.approx(1.5) and found.low <= found.slope <= found.high
+def test_the_exponent_of_a_power_law_is_found_with_an_interval_that_widens_with_noise():
+    slope, low, high = power_law({n: 3e-4 * n**1.5 for n in (1, 4, 16, 64)})
+    assert slope == pytest.approx(1.5) and low <= slope <= high and high - low < 1e-6
     noisy = {1: 1.0, 4: 5.0, 16: 14.0, 64: 70.0}
-    monkeypatch.setattr(benchmarks, "taking_turns", lambda calls, rounds: noisy)
-    found = benchmarks.growth("things", dict.fromkeys(noisy, _busy), 1)
-    slope, _ = np.polyfit(np.log(list(noisy)), np.log(list(noisy.values())), 1)
-    assert found.slope == pytest.approx(slope) and found.high - found.low > 0.05
+    slope, low, high = power_law(noisy)
+    expected, _ = np.polyfit(np.log(list(noisy)), np.log(list(noisy.values())), 1)
+    assert slope == pytest.approx(expected) and low < slope < high and high - low > 0.05
 
 
 def _busy():
@@ -52,11 +50,11 @@ def _busy():
 
 
 def test_a_profile_names_the_function_that_takes_the_time_first():
-    table = benchmarks.profile(_busy, 3)
+    table = profile_call(_busy, 3)
     assert len(table) <= 3 and "process_time" in " ".join(table.index[:2]) + "_busy" and table.share.iloc[0] > 0.3
     assert any(name.endswith(":_busy") for name in table.index)
 
 
 def test_the_bank_pays_after_its_own_price():
-    price = benchmarks.BankCost(bank=100.0, head=1.0, live=60.0)
+    price = BankCost(bank=100.0, head=1.0, live=60.0)
     assert price.heads(1) == (101.0, 60.0) and price.heads(10) == (110.0, 600.0)

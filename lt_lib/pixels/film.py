@@ -8,9 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
-from torch import Tensor
 
-from lt_lib.comm.channel import Channel
 from lt_lib.envs.arena import CONTROL_HZ, HORIZON, Arena
 from lt_lib.envs.camera import FastCamera, colours
 from lt_lib.envs.layout import SIDES, Layout
@@ -18,7 +16,7 @@ from lt_lib.envs.reference import TopView
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.episodes import Draws
 from lt_lib.pixels.executor import FrozenExecutor
-from lt_lib.pixels.route import committed_wires, read_head, sent_contents
+from lt_lib.pixels.route import read_head, sent_wires
 from lt_lib.store.run import Result
 
 BAND = 22  # pixels of caption above the pictures
@@ -107,7 +105,9 @@ def film_pair(
     """
     draws = Draws(bank["spawn"][:1], bank["scout"][:1])
     frozen, driver = FrozenEncoder(encoder), FrozenExecutor(executor)
-    wires = {name: _wires(layout, frozen, name, draws, commit_step) for name in ("floor", "latent")}  # (slab, w)
+    wires = {
+        name: sent_wires(layout, frozen, name, *draws, commit_step)[0] for name in ("floor", "latent")
+    }  # (slab, w)
     slab = int(read_head(heads["floor"][0]).policy(wires["floor"]).probs[0].argmax())
     paths = []
     for name, wire in wires.items():
@@ -116,13 +116,3 @@ def film_pair(
         every = max(1, len(take.poses) // 40)
         paths.append(save_gif(folder / "figures" / f"04_{name}.gif", pictures(layout, take, every, f"message: {name}")))
     return paths
-
-
-def _wires(
-    layout: Layout, encoder: FrozenEncoder, content: str, draws: Draws, commit_step: int
-) -> Float[Tensor, "s w"]:
-    """What reaches the navigator of the first draw under either placement of the slab."""
-    (sent,) = sent_contents(layout, encoder, content, *draws)  # (slab, c)
-    channel = Channel((len(sent),), sent.shape[1], layout.communication_radius)
-    scout, spawn = (pose[:1, :2].repeat(len(sent), axis=0) for pose in draws)
-    return committed_wires(channel, commit_step, sent, scout, spawn)

@@ -82,6 +82,21 @@ def sent_contents(
     return torch.stack(contents, dim=1)
 
 
+def sent_wires(
+    layout: Layout,
+    encoder: FrozenEncoder,
+    content: str,
+    spawn: Float[np.ndarray, "e 3"],
+    scout: Float[np.ndarray, "e 3"],
+    commit_step: int,
+) -> Float[Tensor, "e slab w"]:
+    """What reaches the navigator at the commit step of each draw of the scene, under either placement."""
+    contents = sent_contents(layout, encoder, content, spawn, scout)  # (e, slab, c)
+    channel = Channel((SLABS * len(spawn),), contents.shape[-1], layout.communication_radius)
+    places = (np.repeat(poses[:, :2], SLABS, axis=0) for poses in (scout, spawn))  # (e * slab, 2)
+    return committed_wires(channel, commit_step, contents.flatten(0, 1), *places).unflatten(0, (-1, SLABS))
+
+
 def read_bank(
     config: HeadConfig | EvaluationConfig, bank: Mapping[str, np.ndarray], encoder: Mapping[str, np.ndarray]
 ) -> tuple[Bank, Bank]:

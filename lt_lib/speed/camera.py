@@ -1,4 +1,4 @@
-"""How much faster the fast camera is than `mujoco.Renderer` (Section Setup's camera)."""
+"""How much faster the fast camera is than `mujoco.Renderer` (Section Setup)."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,7 +7,7 @@ from lt_lib.envs.camera import FastCamera, network_input
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.speed.turns import taking_turns
 
-BATCH, SLOW_BATCH = 256, 32  # frames per turn: what a training asks for at a time, and fewer of the slow ones
+BATCH, SLOW_BATCH = 256, 32  # frames per turn: as many as training requests at once, and fewer for the slow renderer
 
 
 def frame_rates(
@@ -18,10 +18,10 @@ def frame_rates(
     others: Float[np.ndarray, "b 2"],
     rounds: int = 5,
 ) -> dict[str, float]:
-    """Frames a second of processor time, the median over rounds in which the cameras take turns.
+    """Frames per second of processor time: the median over rounds in which the cameras take turns.
 
-    Processor time counts all threads of this process, so these are the rates of one core; a renderer on a GPU
-    would hide its work from it.
+    Processor time includes all threads of this process, so these are rates of one core. A renderer on a GPU would hide
+    its work from this clock. Arguments as for `FastCamera.frames`.
     """
     scenes = [values[np.arange(BATCH) % len(eyes)] for values in (eyes, np.asarray(slabs), others)]
     few = [values[:SLOW_BATCH] for values in scenes]

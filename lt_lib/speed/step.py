@@ -1,4 +1,6 @@
-"""What one control step costs, stage by stage, with the fast camera and with `mujoco.Renderer`, side by side."""
+"""The cost of one control step: frame, latent, velocity, physics."""
+
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -8,8 +10,8 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.perception.encoder import FrozenEncoder
-from lt_lib.pixels.episodes import draw_scenes
-from lt_lib.pixels.executor import FrozenExecutor
+from lt_lib.pixels.episodes import SLABS, draw_scenes
+from lt_lib.pixels.executor import ROUTES, FrozenExecutor
 from lt_lib.speed.turns import taking_turns
 from lt_lib.store.run import Result
 
@@ -17,30 +19,49 @@ ENVS = 64  # scenes stepped side by side, as in training
 
 
 def step_costs(layout: Layout, encoder: Result, executor: Result, rounds: int = 7) -> pd.DataFrame:
-    """Microseconds of processor time a scene and control step: the median over rounds in which all stages take turns.
+    """Microseconds of processor time per scene and control step, by stage, with either camera.
 
-    Processor time counts every thread, so these are the costs on one core. Columns: with either camera.
+    Each number is the median over rounds in which all stages take turns. Processor time includes every thread, so these
+    are costs on one core.
     """
-    arena, frozen, driver = Arena(layout, ENVS), FrozenEncoder(encoder), FrozenExecutor(executor)
-    fast, reference, rng = FastCamera(layout), ReferenceCamera(layout), np.random.default_rng(0)
-    draws, route = draw_scenes(layout, ENVS, rng), rng.integers(0, 2, ENVS)
-    arena.reset(np.ones(ENVS, bool), draws.spawn, rng.integers(0, 2, ENVS), draws.scout)
-    frames = fast.frames(arena.pose, arena.slab, arena.scout[:, :2])
-    latent = frozen.latent(frames)
-    action = driver.mean_action(latent, route)
+    arena, route = _started(layout, ENVS)
+    fast, reference = FastCamera(layout), ReferenceCamera(layout)
+    frozen, driver = FrozenEncoder(encoder), FrozenExecutor(executor)
+    frames = fast.frames(arena.pose, arena.slab, arena.scout[:, :2])  # (64, H, W)
+    latent = frozen.latent(frames)  # (64, 64)
+    action = driver.mean_action(latent, route)  # (64, 3)
     stages = {
-        "camera": lambda: fast.frames(arena.pose, arena.slab, arena.scout[:, :2]),
+        "fast camera": lambda: fast.frames(arena.pose, arena.slab, arena.scout[:, :2]),
         "mujoco.Renderer": lambda: reference.pictures(arena.pose, arena.slab, arena.scout[:, :2]),
+        "physics": lambda: arena.step(action),
         "encoder": lambda: frozen.latent(frames),
         "policy": lambda: driver.mean_action(latent, route),
-        "physics": lambda: arena.step(action),
     }
     cost = {stage: seconds / ENVS * 1e6 for stage, seconds in taking_turns(stages, rounds).items()}
     reference.close()
     shared = {stage: cost[stage] for stage in ("physics", "encoder", "policy")}
-    table = pd.DataFrame({
-        "fast camera": {"camera": cost["camera"], **shared},
-        "mujoco.Renderer": {"camera": cost["mujoco.Renderer"], **shared},
-    })  # fmt: skip
+    table = pd.DataFrame({name: {"camera": cost[name], **shared} for name in ("fast camera", "mujoco.Renderer")})
     table.loc["whole step"] = table.sum()
     return table
+
+
+def control_step(
+    layout: Layout, encoder: Result, executor: Result, envs: int, precision: str = "float32"
+) -> Callable[[], None]:
+    """A call that takes one control step in `envs` scenes side by side: frame, latent, velocity, physics."""
+    arena, route = _started(layout, envs)
+    camera, frozen, driver = FastCamera(layout), FrozenEncoder(encoder, precision=precision), FrozenExecutor(executor)
+
+    def step() -> None:
+        latent = frozen.latent(camera.frames(arena.pose, arena.slab, arena.scout[:, :2]))
+        arena.step(driver.mean_action(latent, route))
+
+    return step
+
+
+def _started(layout: Layout, envs: int) -> tuple[Arena, np.ndarray]:
+    """An arena at the start of its episodes, and a commanded route (envs,) for each."""
+    arena, rng = Arena(layout, envs), np.random.default_rng(0)
+    draws, route = draw_scenes(layout, envs, rng), rng.integers(0, ROUTES, envs)
+    arena.reset(np.ones(envs, bool), draws.spawn, rng.integers(0, SLABS, envs), draws.scout)
+    return arena, route
