@@ -108,7 +108,7 @@ def test_report_s_first_page_has_every_row_of_the_scoreboard_with_its_verdict_in
 def test_a_folder_without_outputs_is_refused_in_one_line(tmp_path, capsys):
     assert main(["--outputs", str(tmp_path)]) == 2
     out, err = capsys.readouterr()
-    assert (out, err) == ("", f"report: {tmp_path / 'scoreboard.md'} is missing; run_all.py makes it\n")
+    assert (out, err) == ("", f"report: {tmp_path / 'scoreboard.md'} is missing; run_all.py writes it\n")
 
 
 # --- JupyterLab

@@ -142,15 +142,15 @@ def test_paper_meets_every_criterion_of_its_own():
     "text, complaint",
     [
         (GOOD.replace("margin", "margn"), "a.margn: unknown parameter"),
-        (GOOD + GOOD, "a is there twice"),
+        (GOOD + GOOD, "a appears twice"),
         (GOOD.replace("02_encoder", "02_decoder"), "a.nb: must be '01_occlusion_check'"),
         (GOOD.replace("paper: 0.9, ", ""), "a.paper: Field required"),
         (GOOD.replace("0.05", "3e-4x"), "a.margin"),
-        (GOOD.replace("0.05", "0.05, at_least: 1"), "a: kind measured takes at most one of"),
-        (GOOD.replace("margin: 0.05", "digits: 2"), "a: kind measured takes at most one of"),
-        (GOOD.replace(", margin: 0.05", ""), "a: not said when it is reproduced"),
-        (GOOD.replace("0.05", "[0.05, 0.1]"), "a: expected a margin for each of 0.9"),
-        (GOOD.replace("measured", "config"), "a: kind config takes at most one of"),
+        (GOOD.replace("0.05", "0.05, at_least: 1"), "a: kind measured allows at most one of"),
+        (GOOD.replace("margin: 0.05", "digits: 2"), "a: kind measured allows at most one of"),
+        (GOOD.replace(", margin: 0.05", ""), "a: no criterion for reproduction"),
+        (GOOD.replace("0.05", "[0.05, 0.1]"), "a: expected one margin for each of 0.9"),
+        (GOOD.replace("measured", "config"), "a: kind config allows at most one of"),
         ("a: 1\n", "expected a list of entries"),
         ("- [\n", "cannot be read"),
         (None, "cannot be read"),
@@ -299,7 +299,7 @@ def test_findings_are_plain_json_with_profile_and_verdict(tmp_path, few):
     "name, value, fields, complaint",
     [
         ("e.probe", 0.5, {}, "e.probe is not one of its claims; they are px.latent.route"),
-        ("px.words", "monotone", {}, "px.words was added already"),
+        ("px.words", "monotone", {}, "px.words was already added"),
         ("px.latent.route", math.nan, {}, "value must be finite, got nan"),
         ("px.latent.route", np.float32("inf"), {}, "value must be finite, got inf"),
         ("px.latent.route", 0.5, {"seeds": [0.5, math.nan]}, "seeds must be finite"),
@@ -334,7 +334,7 @@ def test_bad_findings_are_one_clear_line(tmp_path, few, name, value, fields, com
     "pending, complaint",
     [
         ([], "no finding for e.probe"),
-        (["px.words"], "px.words is given as pending but is not one of its claims"),
+        (["px.words"], "px.words is listed as pending but is not one of its claims"),
     ],
 )
 def test_findings_must_be_complete(tmp_path, few, pending, complaint):
@@ -346,7 +346,7 @@ def test_findings_must_be_complete(tmp_path, few, pending, complaint):
 def test_a_finding_cannot_be_pending_too(tmp_path, few):
     encoder = Findings("02_encoder", tmp_path, "full", few)
     encoder.add("e.probe", 0.9)
-    with pytest.raises(UserError, match=r"e\.probe is given as pending but was added"):
+    with pytest.raises(UserError, match=r"e\.probe is listed as pending but was added"):
         encoder.write(["e.probe"])
 
 
@@ -443,7 +443,7 @@ def test_an_id_in_two_files_is_an_error(tmp_path, few):
         (lambda c: c["pending"].clear(), "04_pixels.json: no finding for px.set"),
         (
             lambda c: c.update(profile="smoke"),
-            "04_pixels.json: made with profile smoke, this scoreboard is of full",
+            "04_pixels.json: made with profile smoke, but this scoreboard is for full",
         ),
         (lambda c: c.update(notebook="02_encoder"), "04_pixels.json: was written by 02_encoder"),
         (lambda c: c["findings"]["px.zero"].update(value=math.nan), "px.zero"),

@@ -320,7 +320,7 @@ BAD = {
     "number for an interval": ({"barrier": 1.2}, "barrier: "),
     "nothing in an interval": ({"barrier": [None, 1.2]}, "barrier.0: "),
     "no list": ({"corridors.left.legs": 3}, "corridors.left.legs: "),
-    "slabs of two sizes": ({"corridors.right.slab.x": [0.9, 1.8]}, "the slab must be as large in either corridor"),
+    "slabs of two sizes": ({"corridors.right.slab.x": [0.9, 1.8]}, "the slab must have the same size in both"),
     "camera over the walls": ({"camera.height": 1.5}, "camera.height 1.5 m must be below"),
     "scout looks away": ({"scout.heading": 0.0}, "the scout cannot see the slab in the left corridor"),
     "scout sees one side": ({"scout.heading": 135.0}, "the scout cannot see the slab in the right corridor"),

@@ -1,8 +1,8 @@
-"""The scene: one layout, its physics, its cameras (Section Setup)."""
+"""The scene: one layout, its physics and its cameras (Section Setup)."""
 
 import os
 
-# MuJoCo loads OpenGL when it is first imported, though only pictures need it: `envs.opengl` opens it for those.
+# MuJoCo loads OpenGL on its first import, although only rendering needs it; `envs.opengl` opens it for that.
 _named = os.environ.get("MUJOCO_GL")
 os.environ["MUJOCO_GL"] = "disable"
 import mujoco  # noqa: F401

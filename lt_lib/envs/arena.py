@@ -1,7 +1,7 @@
-"""The walled arena in MuJoCo (Section Setup): many navigators stepped at once.
+"""The walled arena in MuJoCo (Section Setup), many navigators stepped together.
 
 Physics runs at 60 Hz and control at 10 Hz. An action is a body-frame velocity (vx, vy, omega) in [-1, 1]^3, scaled
-to 0.5 m/s and 1.5 rad/s. The slab is solid, so a step in contact with it is a step wasted, not a shortcut.
+to 0.5 m/s and 1.5 rad/s. The slab is solid, so a step in contact with it is a wasted step, not a shortcut.
 """
 
 import mujoco
@@ -16,21 +16,25 @@ CONTROL_HZ = 10
 V_MAX = 0.5  # m/s
 W_MAX = 1.5  # rad/s
 HORIZON = 600  # control steps
-CONTACT = 0.005  # metres: nearer than this counts as touching
+CONTACT = 0.005  # metres; anything nearer counts as touching
 NO_CORRIDOR = -1
 
 MASS, GAIN, FORCE = (
     1.0,
     100.0,
     20.0,
-)  # kg, N s/m, N: full speed within three physics steps, no push through a wall
+)  # kg, N s/m, N: reaches full speed within three physics steps, cannot push through a wall
 
 
 class Arena:
-    """n independent scenes; `pose` (n, 3) holds the navigators' metres, metres, radians.
+    """n independent scenes, each with one navigator. The attributes describe the state after the latest step:
 
-    `contact` (n,) is whether the navigator touches the slab, `reached` (n,) whether it is at the goal and
-    `corridor` (n,) the corridor that it stands in (0 left, 1 right, -1 none), all after the latest step.
+    pose      (n, 3) x, y, heading of the navigators: metres, metres, radians
+    slab      (n,) blocked corridor, 0 left, 1 right
+    scout     (n, 3) the scouts' poses
+    contact   (n,) whether the navigator touches the slab
+    reached   (n,) whether the navigator is at the goal
+    corridor  (n,) the corridor that the navigator stands in: 0 left, 1 right, -1 none
     """
 
     def __init__(self, layout: Layout, n: int):
@@ -58,7 +62,7 @@ class Arena:
         slab: Int[np.ndarray, " n"],
         scout: Float[np.ndarray, "n 3"],
     ):
-        """New episodes in the scenes of `which`: navigator and scout poses, blocked corridor (0 left, 1 right)."""
+        """Starts new episodes in the scenes of `which`; the slab blocks the left (0) or the right (1) corridor."""
         self._qpos[which], self._qvel[which], self._warm[which] = pose[which], 0.0, 0.0
         self.slab[which], self.scout[which] = slab[which], scout[which]
         self._mocap[which, 0, :2] = self._slab_centre[slab[which]]
@@ -66,7 +70,7 @@ class Arena:
         self._observe()
 
     def step(self, action: Float[np.ndarray, "n 3"], live: Bool[np.ndarray, " n"] | None = None):
-        """One control step of 0.1 s; actions are clipped to [-1, 1]. Scenes that are not `live` stand still."""
+        """Takes one control step of 0.1 s; actions are clipped to [-1, 1]. Scenes that are not `live` stand still."""
         vx, vy, turn = np.clip(action, -1.0, 1.0).T
         cos, sin = np.cos(self._qpos[:, 2]), np.sin(self._qpos[:, 2])
         self._ctrl[:, 0] = V_MAX * (cos * vx - sin * vy)
@@ -84,7 +88,7 @@ class Arena:
 
 
 def physics_xml(layout: Layout) -> str:
-    """MJCF of what can be bumped into; planar, without a floor, the robot's disc as a sphere."""
+    """MJCF of everything that can be hit: planar, without a floor, each robot's disc as a sphere."""
     walls = "".join(solid(wall) for wall in layout.walls)
     slab = layout.slab(0)
     (cx, cy), (x0, x1, y0, y1) = slab.centre, slab.bounds
@@ -114,7 +118,7 @@ def physics_xml(layout: Layout) -> str:
 
 
 def solid(box: Box, attributes: str = "") -> str:
-    """MJCF of a box, with further attributes of its geom."""
+    """MJCF of a box; `attributes` are added to its geom."""
     x0, x1, y0, y1 = box.bounds
     centre = " ".join(f"{value:.6f}" for value in (*box.centre, box.height / 2))
     size = f"{(x1 - x0) / 2:.6f} {(y1 - y0) / 2:.6f} {box.height / 2:.6f}"

@@ -1,4 +1,4 @@
-"""Loops that numba compiles once and keeps, also where neither the checkout nor a home can be written."""
+"""Compiled loops that numba keeps between processes, even where neither the checkout nor a home is writable."""
 
 import getpass
 import os
@@ -11,10 +11,10 @@ import numba
 
 
 def compiled(**options: Any) -> Callable[[Callable], Callable]:
-    """A decorator: `numba.njit` with its options, and the compiled code kept for the next process.
+    """A decorator: `numba.njit` with these options, whose compiled code the next process reuses.
 
-    numba keeps it beside the source or in the user's cache; where it can write neither, it goes into a folder of the
-    user's own under the system's temporary one.
+    Numba keeps the code beside the source or in the user's cache. Where it can write to neither, the code goes to the
+    user's own folder under the system's temporary folder.
     """
 
     def decorate(function: Callable) -> Callable:
@@ -28,7 +28,7 @@ def compiled(**options: Any) -> Callable[[Callable], Callable]:
 
 
 def _own_temporary_folder() -> Path:
-    """A folder that nobody else can write, since what is kept there is executed."""
+    """A folder that nobody else can write to, because its contents are executed."""
     folder = Path(tempfile.gettempdir()) / f"lt_lib-compiled-{_user()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     if hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():

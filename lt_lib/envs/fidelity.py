@@ -1,4 +1,4 @@
-"""How well the fast camera agrees with `mujoco.Renderer` (Section Setup's camera)."""
+"""How well the fast camera agrees with `mujoco.Renderer` (Section Setup)."""
 
 from typing import NamedTuple
 
@@ -11,11 +11,11 @@ from lt_lib.envs.reference import ReferenceCamera
 
 
 class Agreement(NamedTuple):
-    """Over a set of poses."""
+    """How two cameras agree over a set of poses."""
 
-    pixels: float  # share of pixels whose material and face are MuJoCo's
-    flags: float  # share of frames on whose hazard-visible flag both agree
-    grey_levels: int  # largest difference of a colour from MuJoCo's picture, of 255, over the agreeing pixels
+    pixels: float  # share of pixels with MuJoCo's material and face
+    flags: float  # share of frames with MuJoCo's hazard-visible flag
+    grey_levels: int  # largest colour difference from MuJoCo's picture, out of 255, over the agreeing pixels
     frames: int
 
 
@@ -26,9 +26,9 @@ def agreement(
     slabs,
     others: Float[np.ndarray, "b 2"],
 ) -> Agreement:
-    """Compares with MuJoCo's segmentation and with its colours; arguments as for `FastCamera.frames`."""
-    ours, theirs = (camera.frames(eyes, slabs, others) for camera in (fast, reference))
+    """Compares the fast camera with MuJoCo's segmentation and colours; arguments as for `FastCamera.frames`."""
+    ours, theirs = (camera.frames(eyes, slabs, others) for camera in (fast, reference))  # (B, H, W)
     same = ours == theirs
-    flags = HAZARD[ours].any(axis=(1, 2)) == HAZARD[theirs].any(axis=(1, 2))
-    apart = np.abs(colours(ours).astype(int) - reference.pictures(eyes, slabs, others))
+    flags = HAZARD[ours].any(axis=(1, 2)) == HAZARD[theirs].any(axis=(1, 2))  # (B,)
+    apart = np.abs(colours(ours).astype(int) - reference.pictures(eyes, slabs, others))  # (B, H, W, 3)
     return Agreement(float(same.mean()), float(flags.mean()), int(apart[same].max()), len(eyes))

@@ -1,4 +1,4 @@
-"""The one description of the scene (Fig. 1b), in metres; physics, camera and occlusion check are made from it."""
+"""The one description of the scene (Fig. 1b), in metres. Physics, cameras and occlusion check are built from it."""
 
 from functools import cached_property
 from itertools import pairwise
@@ -25,7 +25,7 @@ Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
 
 
 class Rect(Settings):
-    """An upright box's footprint, metres."""
+    """The footprint of an upright box, metres."""
 
     x: Interval
     y: Interval
@@ -35,18 +35,18 @@ class Rect(Settings):
         return (*self.x, *self.y)
 
     def contains(self, x, y):
-        """Whether points (metres) lie inside; broadcasts."""
+        """Whether points (metres) lie inside the footprint; broadcasts."""
         return (self.x[0] <= x) & (x <= self.x[1]) & (self.y[0] <= y) & (y <= self.y[1])
 
     def distance(self, x, y):
-        """Distance (metres) of points to the box, 0 inside; broadcasts."""
+        """Distance in metres from points to the footprint, 0 inside; broadcasts."""
         dx = np.maximum(np.maximum(self.x[0] - x, x - self.x[1]), 0.0)
         dy = np.maximum(np.maximum(self.y[0] - y, y - self.y[1]), 0.0)
         return np.hypot(dx, dy)
 
 
 class Corridor(Settings):
-    """Free rectangles cut out of the barrier, from the mouth on, and the slab that can block them."""
+    """The free rectangles cut out of the barrier, starting at the mouth, and the slab that can block them."""
 
     legs: Annotated[tuple[Rect, ...], Field(min_length=1)]
     slab: Rect
@@ -66,7 +66,7 @@ class Robot(Settings):
 
 
 class Camera(Settings):
-    """A forward pinhole camera on the robot's axis; `fov` in degrees, square frames."""
+    """A forward pinhole camera on the robot's axis with square frames; height in metres, field of view in degrees."""
 
     height: PositiveFloat
     fov: Annotated[float, Field(gt=0, lt=180)]
@@ -74,7 +74,7 @@ class Camera(Settings):
 
 
 class Pose(Settings):
-    """Position in metres, heading in degrees from the x axis."""
+    """A position in metres and a heading in degrees from the x axis."""
 
     x: float
     y: float
@@ -82,17 +82,17 @@ class Pose(Settings):
 
     @property
     def array(self) -> np.ndarray:
-        """(3,) metres, metres, radians."""
+        """(3,) x, y, heading: metres, metres, radians."""
         return np.array([self.x, self.y, np.deg2rad(self.heading)])
 
 
 class JitteredPose(Pose):
-    """A pose drawn anew every episode, uniformly within +- jitter (metres, metres, degrees)."""
+    """A pose drawn anew in every episode, uniformly within +- jitter (metres, metres, degrees)."""
 
     jitter: tuple[float, float, float]
 
     def sample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """n poses, (n, 3) metres, metres, radians."""
+        """n poses, (n, 3): metres, metres, radians."""
         spread = np.array([self.jitter[0], self.jitter[1], np.deg2rad(self.jitter[2])])
         return self.array + rng.uniform(-1, 1, (n, 3)) * spread
 
@@ -104,7 +104,7 @@ class Goal(Settings):
 
 
 class Box(NamedTuple):
-    """An upright box standing on the floor: footprint (x0, x1, y0, y1) and height in metres, and its material."""
+    """An upright box on the floor: footprint (x0, x1, y0, y1) and height in metres, and material."""
 
     bounds: tuple[float, float, float, float]
     height: float
@@ -112,13 +112,13 @@ class Box(NamedTuple):
 
     @property
     def centre(self) -> tuple[float, float]:
-        """x, y of the footprint's centre, metres."""
+        """Centre of the footprint (x, y), metres."""
         x0, x1, y0, y1 = self.bounds
         return (x0 + x1) / 2, (y0 + y1) / 2
 
 
 class Layout(Settings):
-    """The scene. Use `load_layout` to read one; its geometry is checked when it is read."""
+    """The scene. `load_layout` reads one and checks its geometry."""
 
     name: str
     arena: Rect
@@ -140,7 +140,7 @@ class Layout(Settings):
 
     @cached_property
     def walls(self) -> tuple[Box, ...]:
-        """The four outer walls and what is left of the barrier once the corridors are cut out."""
+        """The four outer walls, and what remains of the barrier after the corridors are cut out."""
         (x0, x1), (y0, y1), t = self.arena.x, self.arena.y, OUTER_THICKNESS
         outer = [
             (x0 - t, x0, y0 - t, y1 + t),
@@ -156,7 +156,7 @@ class Layout(Settings):
     def _barrier_blocks(self) -> list[tuple[float, float, float, float]]:
         legs = [leg for corridor in self.routes for leg in corridor.legs]
         cuts = sorted({*self.barrier, *(x for leg in legs for x in leg.x if self.barrier[0] < x < self.barrier[1])})
-        open_blocks, done = {}, []  # y interval -> x where the block began
+        open_blocks, done = {}, []  # y interval -> x at which the block begins
         for x0, x1 in pairwise(cuts):
             solid = set(_complement([leg.y for leg in legs if leg.x[0] <= x0 and x1 <= leg.x[1]], self.arena.y))
             done += [(start, x0, *y) for y, start in open_blocks.items() if y not in solid]
@@ -169,12 +169,12 @@ class Layout(Settings):
         return Box(self.routes[side].slab.bounds, self.slab_height, "slab")
 
     def slab_distance(self, side, x, y):
-        """Metres from points to the slab in the left (0) or right (1) corridor; broadcasts."""
+        """Distance in metres from points to the slab in the left (0) or right (1) corridor; broadcasts."""
         left, right = (route.slab.distance(x, y) for route in self.routes)
         return np.where(side == 0, left, right)
 
     def free(self, x, y, clearance: float = 0.0):
-        """Whether a disc of radius `clearance` (metres) at the points touches no wall; broadcasts."""
+        """Whether a disc of radius `clearance` (metres) centred on the points touches no wall; broadcasts."""
         clear = [Rect(x=b.bounds[:2], y=b.bounds[2:]).distance(x, y) > clearance for b in self.walls]
         return self.arena.contains(x, y) & np.logical_and.reduce(clear)
 
@@ -187,8 +187,10 @@ class Layout(Settings):
         for side, corridor in zip(SIDES, self.routes, strict=True):
             self._check_corridor(side, corridor)
         sizes = [(round(c.slab.x[1] - c.slab.x[0], 6), round(c.slab.y[1] - c.slab.y[0], 6)) for c in self.routes]
-        if sizes[0] != sizes[1]:  # one solid body is moved between the corridors
-            raise ValueError(f"the slab must be as large in either corridor, got {sizes[0]} m left, {sizes[1]} m right")
+        if sizes[0] != sizes[1]:  # one solid body moves between the corridors
+            raise ValueError(
+                f"the slab must have the same size in both corridors, got {sizes[0]} m left, {sizes[1]} m right"
+            )
         for name in ("spawn", "scout", "goal"):
             self._check_standing(name, getattr(self, name))
         for i, point in enumerate(self.choice_points):
@@ -221,16 +223,16 @@ def _complement(holes, whole):
 
 
 def load_layout(name: str) -> Layout:
-    """Reads params/layouts/<name>.yaml, or a path to a yaml file of one's own.
+    """Reads params/layouts/<name>.yaml, or the YAML file at a path given instead of a name.
 
-    Raises UserError, one line, for an unknown name or a scene that cannot be (a corridor narrower than the
-    robot, a robot in a wall, a missing or unknown key).
+    Raises a one-line UserError for an unknown name or an impossible scene: a corridor narrower than the robot, a robot
+    in a wall, a missing or unknown key.
     """
     path = layout_path(name)
     try:
         return Layout(**yaml.safe_load(path.read_text()))
     except (yaml.YAMLError, TypeError) as error:
-        raise UserError(f"layout {path.name}: not a yaml mapping ({str(error).splitlines()[0]})") from error
+        raise UserError(f"layout {path.name}: not a YAML mapping ({str(error).splitlines()[0]})") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))

@@ -1,8 +1,8 @@
-"""What there is to see: every material's palette index and colour. The scene is flat-lit, so an index is a colour."""
+"""The palette index and colour of every visible material. The scene is flat-lit, so an index is a colour."""
 
 import numpy as np
 
-# One colour a face direction, so that a corner between two walls of one material can be seen.
+# One colour per face direction, so that a corner between two walls of one material is visible.
 MATERIALS = {
     "sky": (190, 215, 235),
     "floor": (120, 110, 100),
@@ -20,6 +20,4 @@ INDEX = {name: i for i, name in enumerate(MATERIALS)}
 PALETTE = np.array(list(MATERIALS.values()), dtype=np.uint8)  # (11, 3)
 HAZARD = np.array([name.startswith("slab") for name in MATERIALS])  # (11,)
 WALLS = np.array([name.startswith(("wall", "barrier")) for name in MATERIALS])  # (11,)
-GOAL_PILLAR = (0.2, 0.6)  # radius, height in metres; smaller than the goal's radius, so never touched
-
-# Bytes, so that the compiler can treat 32 pixels at a time.
+GOAL_PILLAR = (0.2, 0.6)  # radius and height, metres; thinner than the goal region, so a robot never touches it

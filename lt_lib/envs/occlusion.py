@@ -1,6 +1,6 @@
 """Who can see the slab (Fig. 1c and d, Section Setup): hazard pixels, counted through any camera.
 
-The navigator must not see it from where it chooses its corridor, under either placement; the scout must.
+Under either placement, the navigator must not see the slab from where it chooses its corridor, and the scout must.
 """
 
 from typing import NamedTuple
@@ -13,20 +13,20 @@ from lt_lib.envs.layout import SIDES, Layout, Pose
 from lt_lib.envs.materials import HAZARD
 from lt_lib.settings.base import UserError
 
-PIXELS = 512  # the paper's occlusion frame is 512 x 512
+PIXELS = 512  # width and height of the paper's occlusion frame
 SLAB = np.flatnonzero(HAZARD).astype(np.uint8)  # the slab's palette indices, which are consecutive
-HEADINGS = np.arange(8) * np.pi / 4  # radians; the views overlap for a field of view over 45 degrees
+HEADINGS = np.arange(8) * np.pi / 4  # radians; neighbouring views overlap if the field of view exceeds 45 degrees
 
 
 class Occlusion(NamedTuple):
-    """Hazard pixels a frame; the last axis is the placement of the slab, 0 left, 1 right."""
+    """Hazard pixels per frame. The last axis is the placement of the slab: 0 left, 1 right."""
 
     navigator: Int[np.ndarray, "points 2"]
     scout: Int[np.ndarray, "2"]
 
 
 class SightMap(NamedTuple):
-    """`pixels` (X, Y): the most hazard pixels in any of 8 headings at (x, y) metres; NaN where no robot can stand."""
+    """`pixels` (X, Y): most hazard pixels in any of 8 headings at (x, y), metres; NaN where no robot can stand."""
 
     x: Float[np.ndarray, " x"]
     y: Float[np.ndarray, " y"]
@@ -36,9 +36,9 @@ class SightMap(NamedTuple):
 def hazard_pixels(
     camera, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
 ) -> Int[np.ndarray, " b"]:
-    """Hazard pixels in each frame; arguments as for `FastCamera.frames`, of which `camera` has to have the call."""
+    """Hazard pixels in each frame. `camera` has the call of `FastCamera.frames`, which explains the other arguments."""
     frames = camera.frames(eyes, slabs, others)
-    return ((frames >= SLAB[0]) & (frames <= SLAB[-1])).sum(axis=(1, 2))  # far faster than looking up HAZARD
+    return ((frames >= SLAB[0]) & (frames <= SLAB[-1])).sum(axis=(1, 2))  # far faster than a look-up in HAZARD
 
 
 def occlusion(layout: Layout, camera) -> Occlusion:
@@ -48,12 +48,12 @@ def occlusion(layout: Layout, camera) -> Occlusion:
 
 
 def under_both(camera, eye: Pose, other: Pose) -> Int[np.ndarray, "2"]:
-    """Hazard pixels from one pose with the slab left and with the slab right; the other robot stands at `other`."""
+    """Hazard pixels from one pose, with the slab left and right; the other robot stands at `other`."""
     return hazard_pixels(camera, np.tile(eye.array, (2, 1)), np.arange(2), np.tile(other.array[:2], (2, 1)))
 
 
 def require_occlusion(layout: Layout) -> None:
-    """Raises UserError, one line, if the navigator can see the slab from a choice point or the scout cannot."""
+    """Raises a one-line UserError if the navigator can see the slab from a choice point or the scout cannot see it."""
     seen = occlusion(layout, FastCamera(layout, PIXELS))
     for slab, side in enumerate(SIDES):
         for i, pixels in enumerate(seen.navigator[:, slab]):
@@ -64,15 +64,15 @@ def require_occlusion(layout: Layout) -> None:
                 )
         if not seen.scout[slab]:
             raise UserError(
-                f"layout {layout.name}: the scout cannot see the slab in the {side} corridor; move it or turn it"
+                f"layout {layout.name}: the scout cannot see the slab in the {side} corridor; move or turn the scout"
             )
 
 
 def sight_map(layout: Layout, slab: int, spacing: float = 0.1, pixels: int = 256) -> SightMap:
-    """From where on the near side the slab (0 left, 1 right) can be seen, whatever the heading.
+    """From where on the near side the slab (0 left, 1 right) is visible in at least one of 8 headings.
 
     spacing  metres between grid points
-    pixels   width and height of the frames that are searched
+    pixels   width and height of the frames searched
     """
     x = np.arange(layout.arena.x[0], layout.barrier[0] + spacing / 2, spacing)
     y = np.arange(layout.arena.y[0], layout.arena.y[1] + spacing / 2, spacing)

@@ -1,6 +1,7 @@
-"""The one place where the project opens OpenGL, which only MuJoCo's own pictures need.
+"""The one place where the project opens OpenGL, which only MuJoCo's own renderer needs.
 
-`python -m lt_lib.envs.opengl` tells in one line whether it opens here: exit status 0, or 2.
+`python -m lt_lib.envs.opengl` exits with status 0 if OpenGL opens here; otherwise it says why in one line and exits
+with status 2.
 """
 
 import contextlib
@@ -18,26 +19,26 @@ from mujoco.rendering.classic import gl_context
 
 from lt_lib.settings.base import ROOT, UserError
 
-# What MuJoCo knows on every system, and what Linux has to be installed for each
+# The names that MuJoCo knows on each system, and the packages that OSMesa needs on Linux
 NAMES = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw"), "Windows": ("wgl", "glfw")}
 OSMESA_PACKAGES = ("libosmesa6",)
 
 
 def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
-    """MuJoCo's renderer for pictures of `height` x `width` pixels. Raises UserError, one line, without OpenGL."""
+    """MuJoCo's renderer for pictures of `height` x `width` pixels. Raises a one-line UserError without OpenGL."""
     require_opengl()
     return mujoco.Renderer(model, height, width)
 
 
 @cache
 def require_opengl() -> None:
-    """Has MuJoCo use the OpenGL that `MUJOCO_GL` names, or else the first that opens: EGL, or a window's.
+    """Makes MuJoCo use the OpenGL that `MUJOCO_GL` names, or otherwise the first that opens: EGL, then a window's.
 
-    Raises UserError, one line naming what to install, if none opens.
+    Raises a one-line UserError that names what to install if none opens.
     """
-    # Mesa loads the system's LLVM. Triton brings another and exports its symbols, so that whichever of the two comes
-    # second calls into the first one's: after a picture, `import triton` ends the process (torch's optimisers import
-    # it). With Triton first, each keeps to its own.
+    # Mesa loads the system's LLVM. Triton ships another LLVM and exports its symbols, so whichever library loads second
+    # calls into the LLVM of the first. After a picture, `import triton` then ends the process, and torch's optimisers
+    # import Triton. If Triton loads first, each library keeps to its own LLVM.
     if importlib.util.find_spec("triton"):
         importlib.import_module("triton")
     for name in _candidates():
@@ -47,9 +48,11 @@ def require_opengl() -> None:
 
 
 def _opens(name: str) -> bool:
-    """Has MuJoCo use an OpenGL by its name, and tries it."""
+    """Whether the OpenGL of this name opens; if so, MuJoCo uses it from now on."""
     with (
-        contextlib.suppress(Exception),  # AttributeError, ImportError, RuntimeError or FatalError, by platform
+        contextlib.suppress(
+            Exception
+        ),  # AttributeError, ImportError, RuntimeError or FatalError, depending on the platform
         mock.patch.dict(os.environ, {"MUJOCO_GL": name}),
         warnings.catch_warnings(action="ignore"),
     ):
@@ -60,12 +63,12 @@ def _opens(name: str) -> bool:
 
 
 def install_line() -> str:
-    """The command that installs what pictures need on Debian and its like; the packages stand in .binder/apt.txt."""
+    """The command that installs what rendering needs on Debian-like systems; .binder/apt.txt lists the packages."""
     return "apt install " + " ".join((ROOT / ".binder" / "apt.txt").read_text(encoding="utf-8").split())
 
 
 def _candidates() -> tuple[str, ...]:
-    """The names to try in turn. Pictures are drawn off screen, so that EGL comes before any display."""
+    """The names to try in turn. Pictures are drawn off screen, so EGL comes before any display."""
     named, known = os.environ.get("MUJOCO_GL", "").lower().strip(), NAMES.get(platform.system(), ("glfw",))
     if named:
         return (named,) if named in known else ()

@@ -1,6 +1,10 @@
-"""The ray-caster's compiled loops: what `FastCamera` runs for every frame, one column of pixels at a time.
+"""The compiled loops of the ray-caster, which draw every frame of `FastCamera` one column of pixels at a time.
 
-Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
+They stand apart from the annotated functions that call them, because run-time shape checks must not wrap compiled code.
+
+Shapes: B frames of P x P pixels, W walls. The robot's eye stands at (ox, oy) at height `eye`. In column c, the ray's
+direction per unit of depth is (dx, dy), with inverses (ix, iy). A ray enters a footprint at depth `enter`, which is
+infinite if it misses, and leaves it at depth `leave`.
 """
 
 import numpy as np
@@ -11,12 +15,13 @@ from lt_lib.envs.materials import INDEX
 _SKY, _FLOOR, _GOAL, _ROBOT = (np.uint8(INDEX[name]) for name in ("sky", "floor", "goal", "robot"))
 _SLAB, _SLAB_TOP = np.uint8(INDEX["slab_x"]), np.uint8(INDEX["slab_z"])
 _FAR = np.float32(np.inf)
-_FASTMATH = {"nnan", "nsz"}  # minima and maxima may be vectorised; infinities keep their meaning
+_FASTMATH = {"nnan", "nsz"}  # lets minima and maxima be vectorised; infinities keep their meaning
 
 
 @compiled()
 def expand(indices, red, green, blue, out):
-    # three tables and no inner loop over channels: twice as fast
+    """Writes the three channels of every palette index: indices (N,), tables (colours,), out (N, 3)."""
+    # three tables and no inner loop over channels are twice as fast
     for i in range(indices.size):
         k = indices[i]
         out[i, 0], out[i, 1], out[i, 2] = red[k], green[k], blue[k]
@@ -24,25 +29,21 @@ def expand(indices, red, green, blue, out):
 
 @compiled(inline="always")
 def _never_zero(direction):
-    """A ray exactly along an axis, turned by less than float32 can tell, so that its inverse is finite."""
+    """Turns a ray exactly along an axis by less than float32 resolves, so that its inverse is finite."""
     return direction if direction != 0 else np.float32(1e-20)
 
 
 @compiled(inline="always")
 def _row(slope, inverse_pixel, size):
     """The first row whose centre lies below a slope (rise over depth)."""
-    # clipped as a float: casting an infinity to an integer is undefined
+    # clipped as a float, because casting an infinity to an integer is undefined
     row = np.float32(0.5) * size - np.float32(0.5) - slope * inverse_pixel
     return int(np.ceil(min(max(row, np.float32(0)), size)))
 
 
-# In the three loops over columns below, ox and oy are the eye, dx and dy a ray's direction per unit of depth, ix and
-# iy their inverses; a ray enters a footprint at the depth `enter` (inf if it misses it) and leaves it at `leave`.
-
-
 @compiled(fastmath=_FASTMATH)
 def _nearest_walls(ox, oy, ix, iy, walls, index, nearest, colour):
-    """Depth and palette index of the nearest wall in every column."""
+    """Depth `nearest` (P,) and palette index `colour` (P,) of the nearest wall in every column; walls are (W, 4)."""
     nearest[:] = _FAR
     for w in range(walls.shape[0]):
         x0, x1, y0, y1 = walls[w, 0] - ox, walls[w, 1] - ox, walls[w, 2] - oy, walls[w, 3] - oy
@@ -58,7 +59,7 @@ def _nearest_walls(ox, oy, ix, iy, walls, index, nearest, colour):
 
 @compiled(fastmath=_FASTMATH)
 def _meet_box(ox, oy, ix, iy, box, enter, leave, axis):
-    """Where every column's ray meets a box, and the axis (0 x, 1 y) that the face it enters through looks along."""
+    """Where every column's ray meets a box (4,), and the axis (0 x, 1 y) that the face it enters points along."""
     x0, x1, y0, y1 = box[0] - ox, box[1] - ox, box[2] - oy, box[3] - oy
     for c in range(enter.shape[0]):
         near_x, far_x = min(x0 * ix[c], x1 * ix[c]), max(x0 * ix[c], x1 * ix[c])
@@ -71,9 +72,9 @@ def _meet_box(ox, oy, ix, iy, box, enter, leave, axis):
 
 @compiled(fastmath=_FASTMATH)
 def _meet_disc(ox, oy, dx, dy, cx, cy, radius, enter, leave):
-    """Where every column's ray meets a disc."""
+    """Where every column's ray meets a disc: the roots of a quadratic in depth."""
     fx, fy = ox - cx, oy - cy
-    outside = fx * fx + fy * fy - radius * radius
+    outside = fx * fx + fy * fy - radius * radius  # positive: the eye stands outside the disc
     for c in range(enter.shape[0]):
         a, b = dx[c] * dx[c] + dy[c] * dy[c], fx * dx[c] + fy * dy[c]
         discriminant = b * b - a * outside
@@ -84,8 +85,9 @@ def _meet_disc(ox, oy, dx, dy, cx, cy, radius, enter, leave):
 
 @compiled()
 def _paint_walls(frame, top, bottom, colour):
+    """Sky, wall and floor of a frame (P, P): column c shows its wall from row top[c] to row bottom[c]."""
     for row in range(frame.shape[0]):
-        line = np.int16(row)  # compared with rows of its own width
+        line = np.int16(row)  # as wide as the rows that it is compared with
         for c in range(frame.shape[1]):
             below = _FLOOR if line >= bottom[c] else colour[c]
             frame[row, c] = _SKY if line < top[c] else below
@@ -93,36 +95,47 @@ def _paint_walls(frame, top, bottom, colour):
 
 @compiled()
 def _paint_objects(frame, enter, leave, axis, nearest, rise, eye, inverse):
-    """Slab, goal pillar and robot over the walls, the farthest first in every column; `rise` (3,) over the eye."""
+    """Paints slab, goal pillar and robot over the walls, the farthest first in every column.
+
+    enter, leave  (3, P) depths of slab, pillar and robot
+    rise          (3,) heights of their tops above the eye
+    """
     size = np.float32(frame.shape[0])
     for c in range(frame.shape[1]):
         while min(enter[0, c], enter[1, c], enter[2, c]) < nearest[c]:
-            far = np.float32(-1)
+            far = np.float32(-1)  # the farthest object in front of the wall, and its number k
             for j in range(3):
                 if far < enter[j, c] < nearest[c]:
                     far, k = enter[j, c], j
-            enter[k, c] = _FAR
+            enter[k, c] = _FAR  # painted
             front = _SLAB + axis[c] if k == 0 else (_GOAL if k == 1 else _ROBOT)
             edge = _row(rise[k] / far, inverse, size)
             frame[edge : _row(-eye / far, inverse, size), c] = front
-            if rise[k] < 0:
+            if rise[k] < 0:  # the top is visible from above
                 frame[_row(rise[k] / leave[k, c], inverse, size) : edge, c] = _SLAB_TOP if k == 0 else front
 
 
 @compiled()
 def draw(eyes, slabs, others, eye, tan, walls, wall_index, wall_height, slab_boxes, slab_height, goal, robot, out):
+    """Draws B frames into out (B, P, P), as palette indices; lengths in metres, angles in radians.
+
+    eyes (B, 3), slabs (B,), others (B, 2): as in `FastCamera.frames`
+    walls (W, 4), slab_boxes (2, 4): footprints (x0, x1, y0, y1)
+    wall_index (W,): palette index of each wall's x faces; its y faces follow it
+    goal (4,): x, y, radius, height;  robot (2,): radius, height;  tan: of half the field of view
+    """
     pixels = out.shape[1]
     size = np.float32(pixels)
-    pixel = np.float32(2) * tan / size
+    pixel = np.float32(2) * tan / size  # width of a pixel at unit depth
     inverse = np.float32(1) / pixel
-    slope = tan - (np.arange(pixels).astype(np.float32) + np.float32(0.5)) * pixel
-    # each array its own: what comes from one allocation might overlap, and then no loop is vectorised
+    slope = tan - (np.arange(pixels).astype(np.float32) + np.float32(0.5)) * pixel  # (P,), positive to the left
+    # one allocation per array (P,): arrays that share one could overlap, and then no loop would be vectorised
     dx, dy, nearest = np.empty(pixels, np.float32), np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     ix, iy = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     top, bottom = np.empty(pixels, np.int16), np.empty(pixels, np.int16)
     colour, axis = np.empty(pixels, np.uint8), np.empty(pixels, np.uint8)
     enter, leave = np.empty((3, pixels), np.float32), np.empty((3, pixels), np.float32)
-    rise = np.array([slab_height - eye, goal[3] - eye, robot[1] - eye], np.float32)
+    rise = np.array([slab_height - eye, goal[3] - eye, robot[1] - eye], np.float32)  # (3,)
     for i in range(eyes.shape[0]):
         ox, oy = np.float32(eyes[i, 0]), np.float32(eyes[i, 1])
         cos, sin = np.float32(np.cos(eyes[i, 2])), np.float32(np.sin(eyes[i, 2]))

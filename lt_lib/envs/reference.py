@@ -1,4 +1,4 @@
-"""The same scene drawn by MuJoCo's own renderer: the reference of the fast camera, and the pictures from above."""
+"""The same scene drawn by MuJoCo's own renderer: the reference for the fast camera, and the view from above."""
 
 import mujoco
 import numpy as np
@@ -8,12 +8,12 @@ from lt_lib.envs.layout import OUTER_THICKNESS, Box, Layout
 from lt_lib.envs.materials import GOAL_PILLAR, INDEX, MATERIALS
 from lt_lib.envs.opengl import open_renderer
 
-FACE = 1e-3  # metres: walls are drawn as thin faces, one colour a direction
+FACE = 1e-3  # metres; walls are drawn as thin faces, one colour per direction
 SEEN, NAVIGATOR, SCOUT, FROM_ABOVE = 0, 1, 2, 3  # geom groups
 
 
 class ReferenceCamera:
-    """`mujoco.Renderer` behind the call of `FastCamera`; slow, exact, needs OpenGL."""
+    """`mujoco.Renderer` behind the call of `FastCamera`: slow and exact. It needs OpenGL."""
 
     def __init__(self, layout: Layout, pixels: int | None = None):
         self.pixels = pixels or layout.camera.pixels
@@ -27,16 +27,16 @@ class ReferenceCamera:
     def frames(
         self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
     ) -> UInt8[np.ndarray, "b h w"]:
-        """Palette indices by MuJoCo's segmentation; arguments as for `FastCamera.frames`."""
+        """Palette indices from MuJoCo's segmentation; arguments as for `FastCamera.frames`."""
         self._renderer.enable_segmentation_rendering()
         frames = self._each(eyes, slabs, others)
         self._renderer.disable_segmentation_rendering()
-        return self._index[frames[..., 0]]  # geom id; background is -1, the last entry
+        return self._index[frames[..., 0]]  # the geom id; the background is -1, the last entry
 
     def pictures(
         self, eyes: Float[np.ndarray, "b 3"], slabs, others: Float[np.ndarray, "b 2"]
     ) -> UInt8[np.ndarray, "b h w 3"]:
-        """The rendered colours, RGB."""
+        """Rendered RGB colours; arguments as for `FastCamera.frames`."""
         return self._each(eyes, slabs, others)
 
     def _each(self, eyes, slabs, others):
@@ -52,9 +52,9 @@ class ReferenceCamera:
 
 
 class TopView:
-    """The arena from straight above without perspective, RGB frames for figures and GIFs.
+    """The arena from straight above, without perspective, as RGB frames for figures and GIFs.
 
-    `extent` is the picture's (left, right, bottom, top) in metres.
+    `extent` holds the picture's (left, right, bottom, top) in metres.
     """
 
     def __init__(self, layout: Layout, width: int = 480):
@@ -71,14 +71,14 @@ class TopView:
         self._options = _looking_at(SEEN, SCOUT, NAVIGATOR, FROM_ABOVE)
 
     def picture(self, navigator, slab: int, scout) -> UInt8[np.ndarray, "h w 3"]:
-        """navigator (3,) and scout (2,) or (3,) in metres and radians; slab 0 left, 1 right."""
+        """The scene with navigator (3,) and scout (2,) or (3,), metres and radians, and slab 0 left or 1 right."""
         place(self._layout, self.model, self._data, navigator, slab, scout[:2])
         self._renderer.update_scene(self._data, camera="above", scene_option=self._options)
         return self._renderer.render().copy()
 
 
 def place(layout: Layout, model, data, eye, slab: int, other):
-    """Puts navigator (metres, radians), slab (0 left, 1 right) and the other robot into an MjData."""
+    """Places the navigator (3,), the slab (0 left, 1 right) and the other robot (2,) in an MjData."""
     height = layout.camera.height
     data.mocap_pos[model.body("navigator").mocapid[0]] = (eye[0], eye[1], height)
     data.mocap_quat[model.body("navigator").mocapid[0]] = (np.cos(eye[2] / 2), 0, 0, np.sin(eye[2] / 2))
@@ -88,7 +88,7 @@ def place(layout: Layout, model, data, eye, slab: int, other):
 
 
 def scene_xml(layout: Layout, pixels: int) -> str:
-    """MJCF of everything that can be seen; flat light, so a pixel's colour is its material's."""
+    """MJCF of everything visible, in flat light, so that a pixel has the colour of its material."""
     (x0, x1), (y0, y1), camera = layout.arena.x, layout.arena.y, layout.camera
     walls = "".join(_faces(i, wall) for i, wall in enumerate(layout.walls))
     above = "".join(_lid(i, wall) for i, wall in enumerate(layout.walls))
@@ -138,7 +138,7 @@ def _rgba(material: str) -> str:
 
 
 def _faces(name, box: Box) -> str:
-    """Four thin faces whose outer sides are the box's sides."""
+    """MJCF of four thin faces whose outer sides are the sides of the box."""
     (x0, x1, y0, y1), h, out = box.bounds, box.height / 2, ""
     for axis, at, across in (
         ("x", x0 + FACE / 2, 0),
@@ -154,7 +154,7 @@ def _faces(name, box: Box) -> str:
 
 
 def _lid(name, box: Box) -> str:
-    """A wall's top, shown only from above."""
+    """MJCF of a wall's top, shown only from above."""
     x0, x1, y0, y1 = box.bounds
     pos, size = ((x0 + x1) / 2, (y0 + y1) / 2, box.height), ((x1 - x0) / 2, (y1 - y0) / 2, FACE)
     return _box(f"lid:{name}", pos, size, FROM_ABOVE, _rgba(f"{box.material}_x"))
@@ -174,7 +174,7 @@ def _robot(layout: Layout, name: str, group: int, material: str, z: float = 0.0)
 
 
 def palette_indices(model: mujoco.MjModel) -> UInt8[np.ndarray, " entries"]:
-    """The palette index of each geom of a scene, and as the last entry the background's."""
+    """The palette index of each geom of a scene; the last entry is the background's."""
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, i) or "" for i in range(model.ngeom)]
     materials = [name.split(":")[0] for name in names]
     return np.array([INDEX.get(name, INDEX["sky"]) for name in materials] + [INDEX["sky"]], np.uint8)

@@ -1,11 +1,11 @@
-"""The same scene drawn by MuJoCo Warp's batch renderer: what the fast camera's speed is compared with.
+"""The same scene drawn by MuJoCo Warp's batch renderer, against which the fast camera's speed is compared.
 
-MuJoCo Warp is written for NVIDIA GPUs and runs on a CPU too.
+MuJoCo Warp is written for NVIDIA GPUs and also runs on a CPU.
 """
 
 import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR  # before MuJoCo Warp starts it: it would list its devices and all its kernels
+wp.config.log_level = wp.LOG_ERROR  # before MuJoCo Warp starts Warp, which would list all devices and kernels
 
 import mujoco
 import mujoco_warp as mjw
@@ -17,9 +17,10 @@ from lt_lib.envs.reference import SCOUT, SEEN, palette_indices, scene_xml
 
 
 class WarpCamera:
-    """MuJoCo Warp behind the call of `FastCamera`, for `worlds` scenes at a time; compiles its kernels at first use.
+    """MuJoCo Warp behind the call of `FastCamera`; it compiles its kernels on first use.
 
-    device: 'cpu' or a CUDA device, as Warp names them
+    worlds  scenes drawn at a time
+    device  'cpu' or a CUDA device, as Warp names them
     """
 
     def __init__(self, layout: Layout, worlds: int, device: str = "cpu"):
@@ -45,8 +46,11 @@ class WarpCamera:
     def frames(
         self, eyes: Float[np.ndarray, "b 3"], slabs: Int[np.ndarray, " b"], others: Float[np.ndarray, "b 2"]
     ) -> UInt8[np.ndarray, "b h w"]:
-        """Palette indices by Warp's segmentation; arguments as for `FastCamera.frames`, one scene a world."""
-        position, turn = self._data.mocap_pos.numpy(), self._data.mocap_quat.numpy()  # (b, bodies, 3 and 4)
+        """Palette indices from Warp's segmentation; arguments as for `FastCamera.frames`, one scene per world."""
+        position, turn = (
+            self._data.mocap_pos.numpy(),
+            self._data.mocap_quat.numpy(),
+        )  # (B, bodies, 3) and (B, bodies, 4)
         position[:, self._mocap["navigator"]] = np.column_stack(
             [eyes[:, :2], np.full(len(eyes), self._layout.camera.height)]
         )
@@ -64,4 +68,4 @@ class WarpCamera:
             mjw.refit_bvh(self._model, self._data, self._context)
             mjw.render(self._model, self._data, self._context)
             mjw.get_segmentation(self._context, 0, self._seen)
-            return self._index[self._seen.numpy()[..., 0]]  # geom id; background is -1, the last entry
+            return self._index[self._seen.numpy()[..., 0]]  # the geom id; the background is -1, the last entry

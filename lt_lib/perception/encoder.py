@@ -1,4 +1,4 @@
-"""The encoder E and predictor P (Sections Encoder and freeze, Implementation), and their frozen form."""
+"""The encoder E, the predictor P and their frozen form (Sections Encoder and freeze, Implementation)."""
 
 from collections.abc import Callable, Mapping
 
@@ -14,11 +14,11 @@ from lt_lib.store.states import restored
 LATENT = 64
 ACTION = 3
 BITS = {torch.float32: torch.int32, torch.bfloat16: torch.int16}
-CHUNK = 1024  # observations encoded at once where there are many
+CHUNK = 1024  # most observations encoded at once
 
 
 class Encoder(nn.Module):
-    """Frames (B, H, W, 3) in [0, 1] to raw latents (B, 64)."""
+    """Maps frames (B, H, W, 3) in [0, 1] to raw latents (B, 64)."""
 
     def __init__(self):
         super().__init__()
@@ -38,7 +38,7 @@ class Encoder(nn.Module):
 
 
 def architecture(encoder: Encoder) -> str:
-    """The encoder's layers in the paper's words, read off the module."""
+    """The encoder's layers in the paper's words, read from the module."""
     convolutions = [layer for layer in encoder.layers if isinstance(layer, nn.Conv2d)]
     channels, kernels, strides = (
         ",".join(str(value) for value in values)
@@ -48,7 +48,7 @@ def architecture(encoder: Encoder) -> str:
 
 
 class Predictor(nn.Module):
-    """Raw latent and action to the next raw latent (the paper's z-hat), as a residual."""
+    """Maps a raw latent and an action to the next raw latent (the paper's z-hat), as a residual."""
 
     def __init__(self):
         super().__init__()
@@ -59,10 +59,10 @@ class Predictor(nn.Module):
 
 
 class Frozen:
-    """E and P after the freeze: no gradient ever, and a normalisation that was fixed before any policy existed.
+    """E and P after the freeze, without gradients, and the normalisation that was fixed before any policy existed.
 
-    Built from a flat mapping of arrays ("E.*", "P.*", "mean", "std"), the form in which weights are stored and
-    handed to runs. A subclass says what E is and how an observation enters it.
+    The weights are a flat mapping of arrays ("E.*", "P.*", "mean", "std"), the form in which they are stored and passed
+    to runs. A subclass defines E and how observations enter it.
     """
 
     def __init__(self, encoder: nn.Module, weights: Mapping[str, np.ndarray], device: str, precision: str):
@@ -74,20 +74,20 @@ class Frozen:
         self._std = torch.tensor(weights["std"], device=self.device)
 
     def inputs(self, observations: UInt8[np.ndarray, "b ..."]) -> Tensor:
-        """Observations as E takes them."""
+        """Observations in the form that E takes."""
         raise NotImplementedError
 
     @torch.no_grad()
     def latent(self, observations: UInt8[np.ndarray, "b ..."]) -> Float[Tensor, "b 64"]:
-        """Normalised latents."""
+        """Normalised latents of observations."""
         return self._normalised(self._encoder(self.inputs(observations)))
 
     @torch.no_grad()
     def predicted(
         self, observations: UInt8[np.ndarray, "b ..."], action: Float[Tensor, "b 3"]
     ) -> Float[Tensor, "b 64"]:
-        """Normalised latents that P predicts for the next observation under an action."""
-        raw = self._encoder(self.inputs(observations))
+        """Normalised latents that P predicts for the next observation, given an action."""
+        raw = self._encoder(self.inputs(observations))  # (B, 64)
         return self._normalised(self._predictor(raw, action.to(self.device, self.dtype)))
 
     def _normalised(self, latent: Float[Tensor, "b 64"]) -> Float[Tensor, "b 64"]:
@@ -95,14 +95,14 @@ class Frozen:
 
 
 class FrozenEncoder(Frozen):
-    """For the fast camera's frames (B, H, W) of palette indices.
+    """The frozen form for the fast camera's frames (B, H, W) of palette indices.
 
-    `precision` is float32 (the reference) or bfloat16 (faster on CPUs that have it).
+    precision  'float32', the reference, or 'bfloat16', faster on CPUs that support it
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu", precision: str = "float32"):
         super().__init__(Encoder(), weights, device, precision)
-        scaled = torch.from_numpy(PALETTE.astype(np.float32) / np.float32(255)).to(self.dtype)
+        scaled = torch.from_numpy(PALETTE.astype(np.float32) / np.float32(255)).to(self.dtype)  # (colours, 3)
         self._table = scaled.view(BITS[self.dtype]).numpy()  # numpy has no bfloat16
 
     def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b h w 3"]:
@@ -110,6 +110,6 @@ class FrozenEncoder(Frozen):
 
 
 def in_chunks(encode: Callable[[np.ndarray], Tensor], observations: np.ndarray) -> Float[np.ndarray, "n 64"]:
-    """What `encode` makes of n observations, CHUNK at a time, so that memory does not grow with n."""
+    """Encodes n observations, CHUNK at a time, which bounds the memory of the activations."""
     parts = [encode(observations[i : i + CHUNK]).cpu() for i in range(0, len(observations), CHUNK)]
     return torch.cat(parts).numpy()

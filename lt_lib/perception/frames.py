@@ -1,4 +1,4 @@
-"""Frames for the encoder: random rollouts from uniform free poses, no labels, no reward (Section Implementation)."""
+"""Random rollouts from uniform free poses, without labels or reward: the encoder's frames (Section Implementation)."""
 
 from typing import NamedTuple
 
@@ -10,12 +10,12 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
 from lt_lib.envs.materials import HAZARD, WALLS
 
-HOLD = 0.9  # chance that a random action is kept for another step; otherwise it is drawn anew
+HOLD = 0.9  # probability that a random action is kept for another step instead of drawn anew
 ARENAS = 640  # rollouts stepped side by side
 
 
 class Rollouts(NamedTuple):
-    """frames (R, T, H, W) palette indices; actions (R, T, 3) in [-1, 1]; poses (R, T, 3) metres, metres, radians."""
+    """R rollouts of T steps: frames of palette indices, actions in [-1, 1], poses in metres, metres, radians."""
 
     frames: UInt8[np.ndarray, "r t h w"]
     actions: Float[np.ndarray, "r t 3"]
@@ -23,7 +23,7 @@ class Rollouts(NamedTuple):
 
 
 def random_rollouts(layout: Layout, rollouts: int, length: int, rng: np.random.Generator) -> Rollouts:
-    """Rollouts of `length` frames; the slab's corridor and the other robot's place are drawn anew for each."""
+    """Rollouts of `length` frames; each draws its own slab corridor and its own pose of the other robot."""
     parts = [_rollouts(layout, min(ARENAS, rollouts - start), length, rng) for start in range(0, rollouts, ARENAS)]
     return Rollouts(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
@@ -48,7 +48,11 @@ def _rollouts(layout: Layout, n: int, length: int, rng: np.random.Generator) -> 
 def free_poses(
     layout: Layout, slab: Int[np.ndarray, " n"], rng: np.random.Generator, apart_from=None
 ) -> Float[np.ndarray, "n 3"]:
-    """Poses uniform over the free arena, clear of walls, of the slab and of other robots (n, 2 or 3)."""
+    """Uniform poses over the free arena, clear of walls, of the slab and of the robots at `apart_from`.
+
+    slab        (n,) 0 left, 1 right
+    apart_from  (n, 2) or (n, 3) metres, or None
+    """
     n, radius = len(slab), layout.robot.radius
     pose, missing = np.empty((n, 3)), np.ones(n, bool)
     low, high = np.array([layout.arena.x, layout.arena.y]).T
@@ -65,10 +69,10 @@ def free_poses(
 
 
 def hazard_visible(frames: UInt8[np.ndarray, "*batch h w"]):
-    """Whether a frame shows the slab; used by the probes and the pictures, never by training."""
+    """Whether each frame shows the slab; for probes and figures, never for training."""
     return HAZARD[frames].any(axis=(-1, -2))
 
 
 def wall_pixels(frames: UInt8[np.ndarray, "*batch h w"]):
-    """How many of a frame's pixels show a wall; likewise."""
+    """How many pixels of each frame show a wall; for probes, never for training."""
     return WALLS[frames].sum(axis=(-1, -2))

@@ -1,8 +1,8 @@
-"""The freeze gates (Section Encoder and freeze): what a checkpoint must show before it may be frozen.
+"""The freeze gates, which a checkpoint must pass before it is frozen (Section Encoder and freeze).
 
-Linear probes say whether the content that a teammate would need is decodable, an effective rank whether the latent has
-collapsed. All are measured on rollouts that the encoder never saw; a rollout's frames are correlated, so the rollout
-is the unit of every interval and of the split into probe training and test.
+Linear probes test whether the content that a teammate needs is decodable; an effective rank tests whether the latent
+has collapsed. All are measured on rollouts that the encoder never saw. The frames of a rollout are correlated, so the
+rollout is the unit of every interval and of the split into probe training and test.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,54 +20,57 @@ from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixel
 from lt_lib.settings.base import UserError
 from lt_lib.settings.perception import GateConfig, Gates
 
-PROBE_SHARE = 0.7  # of the held-out rollouts train the probes, the rest test them
+PROBE_SHARE = 0.7  # of the held-out rollouts train the probes; the rest test them
 
 
 class GateError(UserError):
-    """A checkpoint that failed a gate; the message says which and by how much."""
+    """A checkpoint failed a gate; the message names the gate and the shortfall."""
 
 
 class Measured(NamedTuple):
-    """What `measure_gates` found; accuracies and R^2 on test rollouts."""
+    """What `measure_gates` measures; accuracies and R^2 are those on test rollouts."""
 
     hazard: float  # accuracy of the linear hazard-visible probe
-    hazard_low: float  # 95% Student-t interval over rollouts
+    hazard_low: float  # 95% Student-t interval of that accuracy over rollouts
     hazard_high: float
-    majority: float  # accuracy of always guessing the commoner answer
+    majority: float  # accuracy of always guessing the more frequent answer
     walls: float  # R^2 of the linear wall-count probe
-    rank: float  # exponential of the entropy of the normalised singular values
-    rank_eigen: float  # the same of the covariance's eigenvalues
+    rank: float  # exponential of the entropy of the normalised singular values of the latents
+    rank_eigen: float  # the same for the eigenvalues of the covariance
 
 
 def effective_rank(latent: Float[np.ndarray, "b d"], power: int = 1) -> float:
-    """exp of the spectral entropy of the centred latents' singular values, raised to `power` (2: eigenvalues)."""
-    spectrum = np.linalg.svd(latent - latent.mean(axis=0), compute_uv=False) ** power
+    """Exponential of the entropy of the centred latents' normalised spectrum.
+
+    power  1: singular values; 2: eigenvalues of the covariance
+    """
+    spectrum = np.linalg.svd(latent - latent.mean(axis=0), compute_uv=False) ** power  # (d,)
     share = spectrum / spectrum.sum()
     return float(np.exp(-(share * np.log(np.maximum(share, 1e-300))).sum()))
 
 
 def encode(encoder: FrozenEncoder, frames: UInt8[np.ndarray, "*batch h w"]) -> Float[np.ndarray, "*batch d"]:
-    """Normalised latents of any number of frames."""
+    """Normalised latents of frames with any leading axes."""
     return in_chunks(encoder.latent, frames.reshape(-1, *frames.shape[-2:])).reshape(*frames.shape[:-2], LATENT)
 
 
 def measure_gates(
     config: GateConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray]
 ) -> dict:
-    """Probes and rank of a checkpoint on held-out rollouts; also the latents' picture.
+    """Probes and rank of a checkpoint on held-out rollouts, and a t-SNE map of latents.
 
-    Fields of `Measured`, and for `config.shown` frames: "latent.plane" (n, 2) by t-SNE,
-    "latent.pose" (n, 3), "latent.hazard" (n,) pixels of hazard.
+    Returns the fields of `Measured` and, for n = `config.shown` frames, "latent.plane" (n, 2) by t-SNE, "latent.pose"
+    (n, 3) and "latent.hazard" (n,), whether the slab is visible.
     """
     rng = np.random.default_rng([seed, 5])
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
     latents = encode(FrozenEncoder(encoder, config.device), rollouts.frames)  # (R, T, 64)
     report(0.5)
-    visible, walls = hazard_visible(rollouts.frames), wall_pixels(rollouts.frames)
+    visible, walls = hazard_visible(rollouts.frames), wall_pixels(rollouts.frames)  # (R, T) each
     cut = int(len(latents) * PROBE_SHARE)
-    train, test = latents[:cut].reshape(-1, LATENT), latents[cut:].reshape(-1, LATENT)
+    train, test = latents[:cut].reshape(-1, LATENT), latents[cut:].reshape(-1, LATENT)  # (frames, 64) each
     probe = LogisticRegression(max_iter=2000).fit(train, visible[:cut].ravel())
-    right = (probe.predict(test) == visible[cut:].ravel()).reshape(visible[cut:].shape).mean(axis=1)  # per rollout
+    right = (probe.predict(test) == visible[cut:].ravel()).reshape(visible[cut:].shape).mean(axis=1)  # (rollouts,)
     low, high = t.interval(0.95, len(right) - 1, loc=right.mean(), scale=right.std(ddof=1) / np.sqrt(len(right)))
     wall_probe = LinearRegression().fit(train, walls[:cut].ravel())
     commoner = visible[:cut].mean() > 0.5
@@ -87,7 +90,7 @@ def _picture(rollouts, latents, n: int, rng: np.random.Generator) -> dict:
     frames = rollouts.frames.reshape(-1, *rollouts.frames.shape[2:])
     flat = latents.reshape(-1, LATENT)
     shown = rng.choice(len(flat), min(n, len(flat)), replace=False)
-    # not principal components: a latent of high rank has no two that stand for the rest
+    # t-SNE, because a latent of high rank has no two principal components that stand for the rest
     plane = TSNE(perplexity=min(30, len(shown) // 4), init="pca", random_state=0).fit_transform(flat[shown])
     return {
         "latent.plane": plane,
@@ -97,7 +100,7 @@ def _picture(rollouts, latents, n: int, rng: np.random.Generator) -> dict:
 
 
 def require_gates(found: Mapping[str, float], gates: Gates) -> None:
-    """Raises GateError unless the checkpoint passes every pre-registered gate."""
+    """Raises GateError unless the checkpoint passes every preregistered gate."""
     require(
         found,
         {
@@ -109,7 +112,7 @@ def require_gates(found: Mapping[str, float], gates: Gates) -> None:
 
 
 def require(found: Mapping[str, float], limits: Mapping[str, tuple[str, float]]) -> None:
-    """Raises GateError naming what is found to be short of its limit; limits are {name: (words, least value)}."""
+    """Raises GateError, naming every value that falls short of its limit; limits are {name: (words, least value)}."""
     failed = [
         f"{words} {found[name]:.3f} is {limit - found[name]:.3f} short of {limit:.3f}"
         for name, (words, limit) in limits.items()

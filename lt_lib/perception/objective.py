@@ -1,11 +1,11 @@
 """The joint-embedding predictive objective and its optimisation, for any encoder (Section Encoder and freeze).
 
-loss = prediction + variance + covariance + reconstruction, each with its weight:
-prediction      P(E(o_t), a_t) against the exponential-moving-average target's latent of o_{t+1}
-variance        hinge that keeps every latent dimension's standard deviation at 1 or above (VICReg)
+The loss is the weighted sum of four terms:
+prediction      squared error of P(E(o_t), a_t) against the latent of o_{t+1} by the exponential-moving-average target
+variance        a hinge that keeps the standard deviation of every latent dimension at 1 or above (VICReg)
 covariance      squared off-diagonal covariance (VICReg)
-reconstruction  class-weighted cross-entropy of a linear read-out of the latent against the observation itself, cell
-                by cell: no label enters
+reconstruction  class-weighted cross-entropy of a linear read-out of the latent against the observation itself, cell by
+                cell, so that no label enters
 """
 
 from collections.abc import Callable
@@ -24,6 +24,8 @@ from lt_lib.store.states import state_of
 
 
 class Losses(NamedTuple):
+    """The four terms of a batch before weighting, scalars."""
+
     prediction: Tensor
     variance: Tensor
     covariance: Tensor
@@ -31,29 +33,29 @@ class Losses(NamedTuple):
 
 
 def variance_loss(latent: Float[Tensor, "b d"]) -> Float[Tensor, ""]:
-    """Mean over dimensions of max(0, 1 - standard deviation)."""
+    """Mean over dimensions of max(0, 1 - standard deviation over the batch)."""
     return F.relu(1 - (latent.var(dim=0) + 1e-4).sqrt()).mean()
 
 
 def covariance_loss(latent: Float[Tensor, "b d"]) -> Float[Tensor, ""]:
-    """Sum of the squared off-diagonal entries of the covariance, over d."""
-    centred = latent - latent.mean(dim=0)
+    """Sum of the squared off-diagonal entries of the covariance, divided by d."""
+    centred = latent - latent.mean(dim=0)  # (B, d)
     covariance = centred.T @ centred / (len(latent) - 1)  # (d, d)
     return (covariance.square().sum() - covariance.diagonal().square().sum()) / latent.shape[1]
 
 
 def class_weights(classes: Int[np.ndarray, "..."], n: int) -> Float[Tensor, " n"]:
-    """One over the square root of a class's share, scaled to a mean of 1 over the cells; 0 for a class never seen."""
-    share = np.bincount(classes.ravel(), minlength=n) / classes.size
+    """Inverse square root of each class's share, scaled to a mean of 1 over the cells; 0 for classes never seen."""
+    share = np.bincount(classes.ravel(), minlength=n) / classes.size  # (n,)
     weights = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 1e-9)), 0)
     return torch.tensor(weights / (weights * share).sum(), dtype=torch.float32)
 
 
 class Jepa(nn.Module):
-    """E, P, the target copy of E and the auxiliary read-out, which is discarded at the freeze."""
+    """E, P, the target copy of E, and the auxiliary read-out, which the freeze discards."""
 
     def __init__(self, encoder: nn.Module, weights: Float[Tensor, " classes"], side: int):
-        """weights: of the classes that the read-out tells apart in each of `side` x `side` cells."""
+        """weights: (classes,) of the classes that the read-out distinguishes in each of `side` x `side` cells."""
         super().__init__()
         self.encoder, self.predictor = encoder, Predictor()
         self.target = deepcopy(self.encoder).requires_grad_(False)
@@ -62,7 +64,7 @@ class Jepa(nn.Module):
 
     @torch.no_grad()
     def goal(self, following: Tensor) -> Float[Tensor, "b 64"]:
-        """The target's latents, which get no gradient."""
+        """The target's latents of the next observations, without gradient."""
         return self.target(following)
 
     def losses(
@@ -72,8 +74,13 @@ class Jepa(nn.Module):
         goal: Float[Tensor, "b 64"],
         classes: Int[Tensor, "b g g"],
     ) -> Losses:
-        """Of steps from E's latents to the target's; classes are those of the first observation's cells."""
-        logits = self.readout(latent).unflatten(1, (-1, *classes.shape[1:]))
+        """Losses of B steps from E's latents to the target's.
+
+        actions  taken at the first observation
+        goal     the target's latents of the second observation
+        classes  of the cells of the first observation, G x G of them
+        """
+        logits = self.readout(latent).unflatten(1, (-1, *classes.shape[1:]))  # (B, classes, G, G)
         return Losses(
             F.mse_loss(self.predictor(latent, actions), goal),
             variance_loss(latent),
@@ -83,7 +90,7 @@ class Jepa(nn.Module):
 
     @torch.no_grad()
     def follow(self, decay: float):
-        """The target moves towards E: target = decay * target + (1 - decay) * E."""
+        """Moves the target towards E: target = decay * target + (1 - decay) * E."""
         for slow, fast in zip(self.target.parameters(), self.encoder.parameters(), strict=True):
             slow.lerp_(fast, 1 - decay)
 
@@ -96,24 +103,27 @@ def fit(
     rng: np.random.Generator,
     report: Callable[[float], None],
 ) -> dict[str, np.ndarray]:
-    """Adam with a one-cycle rate over every step of the rollouts in random order; returns "loss.*" (updates,).
+    """Trains with Adam and a one-cycle rate on every step of the rollouts in random order.
 
-    losses    of a batch: of the steps from time t to t + 1 in the rollouts r, called with (r, t)
-    rollouts  their number and length
+    losses    maps rollouts r (B,) and times t (B,) to the losses of the steps from t to t + 1
+    rollouts  number and length of the rollouts
+    report    receives the share of updates done
+
+    Returns "loss.*" (updates,), each term before weighting.
     """
     number, length = rollouts
-    steps = np.argwhere(np.ones((number, length - 1), bool))
+    steps = np.argwhere(np.ones((number, length - 1), bool))  # (steps, 2): rollout, time
     updates = int(config.epochs * len(steps) / config.batch)
-    curves = np.zeros((updates, len(Losses._fields)), np.float32)
+    curves = np.zeros((updates, len(Losses._fields)), np.float32)  # (updates, 4)
     if updates:
         optimiser = torch.optim.Adam(model.parameters(), lr=config.lr)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.lr, total_steps=updates + 1)
-        order = np.concatenate([rng.permutation(steps) for _ in range(int(np.ceil(config.epochs)))])
+        order = np.concatenate([rng.permutation(steps) for _ in range(int(np.ceil(config.epochs)))])  # (*, 2)
     scale = torch.tensor([config.prediction, config.variance, config.covariance, config.reconstruction])
     scale = scale.to(model.class_weights.device)
     for update in range(updates):
-        r, t = order[update * config.batch : (update + 1) * config.batch].T
-        terms = torch.stack(losses(r, t))
+        r, t = order[update * config.batch : (update + 1) * config.batch].T  # (B,) each
+        terms = torch.stack(losses(r, t))  # (4,)
         optimiser.zero_grad()
         (scale * terms).sum().backward()
         optimiser.step()
@@ -125,7 +135,10 @@ def fit(
 
 
 def frozen(model: Jepa, latents: Float[np.ndarray, "n 64"]) -> dict[str, np.ndarray]:
-    """What is kept of E and P: weights "E.*" and "P.*", and "mean", "std" (64,) of E's latents of training frames."""
+    """The arrays kept at the freeze: weights "E.*" and "P.*", and the normalisation "mean", "std" (64,).
+
+    latents  E's raw latents of the training frames
+    """
     latents = latents.astype(np.float64)
     weights = state_of(model.encoder, "E") | state_of(model.predictor, "P")
     std = latents.std(axis=0, ddof=1) + 1e-6

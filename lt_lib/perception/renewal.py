@@ -1,6 +1,6 @@
-"""Compiled: which frames differ from the ones that are kept, and keeping them.
+"""A compiled loop that finds the frames that differ from the stored ones and stores them.
 
-Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
+It stands apart from the annotated functions that call it, because run-time shape checks must not wrap compiled code.
 """
 
 from lt_lib.envs.compiled import compiled
@@ -8,7 +8,7 @@ from lt_lib.envs.compiled import compiled
 
 @compiled()
 def renew(kept, rows, frames, new):
-    """Puts each of the frames (B, words) into its row of `kept` where it is new, and says in `new` (B,) where it is."""
+    """Stores each of the frames (B, words) that differs from its row of `kept`, and flags it in `new` (B,)."""
     for b in range(frames.shape[0]):
         new[b] = False
         for i in range(frames.shape[1]):

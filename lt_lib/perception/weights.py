@@ -1,4 +1,4 @@
-"""Frozen weights on disk: safetensors beside a JSON sidecar with everything that their use needs."""
+"""Frozen weights on disk: a safetensors file beside a JSON sidecar with everything needed to use it."""
 
 import hashlib
 import json
@@ -16,7 +16,10 @@ FORMAT = 1
 
 
 def save_frozen(folder: Path, kind: str, arrays: Mapping[str, np.ndarray], layout: Layout, facts: Mapping) -> Path:
-    """Writes <kind>.safetensors, then <kind>.json: what it is, the scene it was trained in, how, and its checksum."""
+    """Writes <kind>.safetensors and then its sidecar <kind>.json; returns the path of the former.
+
+    The sidecar holds the kind, the scene of the training, the checksum and `facts`: the settings and the gates passed.
+    """
     payload = safetensors.numpy.save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
     sidecar = {
         "format": FORMAT,
@@ -35,8 +38,8 @@ def save_frozen(folder: Path, kind: str, arrays: Mapping[str, np.ndarray], layou
 def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray]:
     """The arrays of frozen weights.
 
-    Raises UserError, one line, for files that are missing, truncated or altered, of another kind or format, or
-    trained in another scene.
+    Raises a one-line UserError for files that are missing, truncated or altered, that are of another kind or format, or
+    that were trained in another scene.
     """
     path, sidecar_path = folder / f"{kind}.safetensors", folder / f"{kind}.json"
     for needed in (path, sidecar_path):
@@ -47,29 +50,31 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
     payload = path.read_bytes()
     try:
         sidecar = json.loads(sidecar_path.read_text(encoding="utf-8"))
-        expected = sidecar.pop("sidecar_sha256", None)  # sidecars of before it was kept have none
+        expected = sidecar.pop("sidecar_sha256", None)  # older sidecars have none
         found = (sidecar["kind"], sidecar["format"], sidecar["sha256"], sidecar["layout"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
-            f"weights: {sidecar_path} is no sidecar of frozen weights ({error!r}); freeze them again"
+            f"weights: {sidecar_path} is not a sidecar of frozen weights ({error!r}); freeze them again"
         ) from error
     if found[:2] != (kind, FORMAT):
-        raise UserError(f"weights: {path} holds a {found[0]} of format {found[1]}, not a {kind} of format {FORMAT}")
+        raise UserError(
+            f"weights: {path} holds kind {found[0]}, format {found[1]}; expected kind {kind}, format {FORMAT}"
+        )
     if expected not in (None, content_digest(sidecar)):
-        raise UserError(f"weights: {sidecar_path} is altered (it differs from its checksum); freeze them again")
+        raise UserError(f"weights: {sidecar_path} was altered (its checksum differs); freeze the weights again")
     if hashlib.sha256(payload).hexdigest() != found[2]:
         raise UserError(
             f"weights: {path} is truncated or altered (checksum differs from {sidecar_path.name}'s); freeze it again"
         )
     if Layout(**found[3]) != layout:
         raise UserError(
-            f"weights: {path} was trained in another scene than layout '{layout.name}'; train it there or use its own"
+            f"weights: {path} was trained in a scene other than layout '{layout.name}'; train it there or use its own"
         )
     return safetensors.numpy.load(payload)
 
 
 def facts_of(folder: Path, kind: str) -> dict:
-    """What was recorded with frozen weights that `load_frozen` has accepted: their settings and what they passed."""
+    """The facts stored with frozen weights that `load_frozen` has accepted: settings and gates passed."""
     sidecar = json.loads((folder / f"{kind}.json").read_text(encoding="utf-8"))
     beside = ("format", "kind", "sha256", "layout", "sidecar_sha256")
     return {name: value for name, value in sidecar.items() if name not in beside}

@@ -1,1 +1,1 @@
-"""From results to verdicts: statistics, the paper's claims, the scoreboard and its picture."""
+"""From results to verdicts: statistics, the paper's claims, the scoreboard and its figure."""

@@ -1,4 +1,4 @@
-"""The paper's claims, what a notebook finds for them, and the verdict on each.
+"""The paper's claims, a notebook's findings for them, and the verdict on each.
 
 A notebook collects its findings and writes them at its end:
 
@@ -32,7 +32,7 @@ Numbers = Number | tuple[Number, ...]
 Value = Number | str | tuple[Number, ...]
 
 CLAIMS = ROOT / "params" / "claims.yaml"
-JUDGED = ("full", "quick")  # a smaller profile gives no verdict, so that nobody takes it for a result
+JUDGED = ("full", "quick")  # smaller profiles give no verdict, so that nobody takes them for results
 REPRODUCED, SAME_DIRECTION, NOT_REPRODUCED = "reproduced", "same direction", "not reproduced"
 SURROGATE, NOT_RUN, NO_VERDICT = "surrogate", "not run", ""
 CRITERIA = ("digits", "margin", "at_least", "at_most", "equal", "between")
@@ -46,7 +46,7 @@ ALLOWED = {
 
 
 class Claim(Settings):
-    """One entry of claims.yaml, whose head explains every field."""
+    """One entry of claims.yaml; the head of that file explains every field."""
 
     id: str
     nb: Notebook
@@ -70,35 +70,35 @@ class Claim(Settings):
         criteria = [name for name in CRITERIA if getattr(self, name) is not None]
         allowed = ALLOWED[self.kind]
         if len(criteria) > 1 or not set(criteria) <= set(allowed):
-            raise UserError(f"{self.id}: kind {self.kind} takes at most one of {allowed}, got {criteria}")
+            raise UserError(f"{self.id}: kind {self.kind} allows at most one of {allowed}, got {criteria}")
         if not criteria and self.kind != "config" and not self.check and numbers(self.paper):
-            raise UserError(f"{self.id}: not said when it is reproduced; give one of {allowed} or a check")
+            raise UserError(f"{self.id}: no criterion for reproduction; give one of {allowed} or a check")
         if isinstance(self.margin, tuple) and len(self.margin) != len(numbers(self.paper) or ()):
-            raise UserError(f"{self.id}: expected a margin for each of {self.paper}, got {self.margin}")
+            raise UserError(f"{self.id}: expected one margin for each of {self.paper}, got {self.margin}")
         return self
 
     @property
     def criterion(self) -> str:
-        """The name of the one criterion that a machine reads, '' where there is none."""
+        """Name of the one machine-readable criterion, or '' if there is none."""
         return next((name for name in CRITERIA if getattr(self, name) is not None), "")
 
     @property
     def judged_in_words(self) -> bool:
-        """Whether only the notebook's own test can tell if the check is met."""
+        """Whether only the notebook's own test can decide if the check is met."""
         return bool(self.check) and not self.criterion and self.kind in ("measured", "hardware")
 
 
 class Finding(Settings):
     """What a notebook found for one claim.
 
-    value         like the claim's: a number, words, "k of n", or a list (a pair, a range, one a case)
-    seeds         one value a seed, where there are seeds
-    low, high     95% interval of the value, a list where the value is one
-    n             number of seeds (or runs, episodes: what the value is a mean or count of)
-    test, p       the claim's own test in words and its p
-    holds         whether that test holds; None where the claim has no test
-    note          a few words for the reader of a deviation: what was tried, what the cause is
-    real_frames   (hardware) the frames came from the physical camera
+    value        of the same kind as the claim's: a number, words, "k of n", or a list (a pair, a range, one per case)
+    seeds        one value per seed, where there are seeds
+    low, high    95% interval of the value; a list if the value is a list
+    n            number of seeds, or of the runs or episodes over which the value is a mean or a count
+    test, p      the claim's own test in words, and its p
+    holds        whether that test holds; None if the claim has no test
+    note         a few words on a deviation: what was tried, what the cause is
+    real_frames  (hardware) whether the frames came from the physical camera
     """
 
     value: Value
@@ -114,10 +114,10 @@ class Finding(Settings):
 
 
 def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
-    """Every claim by its id, in the file's order.
+    """Every claim by its id, in the order of the file.
 
-    Raises UserError, one line with the id, for an unreadable file, an unknown key or notebook, a missing or
-    malformed value, an id given twice, and a criterion that does not suit the kind.
+    Raises a one-line UserError with the id for an unreadable file, an unknown key or notebook, a missing or malformed
+    value, a duplicate id, and a criterion that does not suit the kind.
     """
     entries = read_yaml(path)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
@@ -126,13 +126,13 @@ def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
     for entry in entries:
         claim = _parse(Claim, entry, f"{path.name}: {entry.get('id')}")
         if claim.id in claims:
-            raise UserError(f"{path.name}: {claim.id} is there twice")
+            raise UserError(f"{path.name}: {claim.id} appears twice")
         claims[claim.id] = claim
     return claims
 
 
 def _parse(model: type[Settings], entry: Mapping[str, Any], where: str) -> Any:
-    """An entry as a model, pydantic's complaint as one line."""
+    """Parses an entry into a model; pydantic's complaint becomes a one-line UserError."""
     try:
         return model.model_validate(dict(entry))
     except ValidationError as error:
@@ -140,7 +140,7 @@ def _parse(model: type[Settings], entry: Mapping[str, Any], where: str) -> Any:
 
 
 def numbers(value: Value) -> tuple[Number, ...] | None:
-    """The numbers of a value: "k of n" is the proportion k / n, words have none."""
+    """The numbers in a value; "k of n" is the proportion k / n, and words have none."""
     if isinstance(value, str):
         count = re.fullmatch(r"(\d+) of ([1-9]\d*)", value)
         return (int(count[1]) / int(count[2]),) if count else None
@@ -150,19 +150,18 @@ def numbers(value: Value) -> tuple[Number, ...] | None:
 def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
     """The verdict on one claim.
 
-    not run          there is no finding
-    '' (none)        any profile but full and quick: the run was too small to tell
-    surrogate        a hardware claim not made from real frames; with real frames it counts as measured
-    reproduced       the claim's criterion is met (below), and its own test, where there is one, holds
-    same direction   a measured claim whose own test holds although the criterion is missed
-    not reproduced   everything else
+    not run         there is no finding
+    '' (none)       the profile is neither full nor quick, so the run is too small to tell
+    surrogate       a hardware claim without real frames; with real frames it counts as measured
+    reproduced      the claim's criterion (below) is met, and its own test, if it has one, holds
+    same direction  a measured claim misses its criterion, but its own test holds
+    not reproduced  everything else
 
-    The criterion, component by component for a list (a list beside one number: every component against it):
-    exact            prints like the paper's at its number of digits
-    config           equal, numbers to a part in 1e9
-    others           within the margin of the paper's, or the machine-readable check; equal words where the
-                     paper gives words; without either, the check in words, which is the notebook's test
-                     (scene: 'reported' needs only a finding)
+    The criterion applies to each component of a list; beside one number of the paper, each of ours must meet it.
+    exact           prints like the paper's value at its number of digits
+    config          equals the paper's value; numbers to a part in 1e9
+    others          lies within the margin or meets the machine-readable check; equals the paper's words; without
+                    either, the check in words, which the notebook's test decides (scene: any finding meets it)
     """
     if finding is None:
         return NOT_RUN
@@ -176,7 +175,7 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
 
 
 def _criterion_met(claim: Claim, finding: Finding) -> bool:
-    """Whether the finding meets the one criterion of its claim; see verdict."""
+    """Whether the finding meets the criterion of its claim; see `verdict`."""
     ours, paper = numbers(finding.value), numbers(claim.paper)
     if paper is None:
         return finding.value == claim.paper and (finding.holds is True or not claim.judged_in_words)
@@ -186,7 +185,7 @@ def _criterion_met(claim: Claim, finding: Finding) -> bool:
             return [f"{a:.{claim.digits}f}" for a in ours] == [f"{b:.{claim.digits}f}" for b in papers]
         case "margin":
             margins = claim.margin if isinstance(claim.margin, tuple) else (claim.margin,) * len(ours)
-            # the last term lets a distance that equals the margin in decimals be within it
+            # the last term admits a distance that equals the margin in decimals
             return all(abs(a - b) <= m + 1e-9 for a, b, m in zip(ours, papers, margins, strict=True))
         case "at_least":
             return min(ours) >= claim.at_least
@@ -205,8 +204,8 @@ class Findings:
     """Collects the findings of one notebook and writes them to <outputs>/results/<notebook>.json.
 
     notebook  its name, e.g. '04_pixels'
-    outputs   folder of the profile's outputs
-    profile   the profile that the numbers were made with; it is recorded with them
+    outputs   the profile's output folder
+    profile   the profile that produced the numbers; it is recorded with them
 
     Raises UserError for an unknown notebook.
     """
@@ -220,19 +219,19 @@ class Findings:
         self.found: dict[str, Finding] = {}
 
     def add(self, name: str, value: Any, *, seeds: Any = None, n: Any = None, **fields: Any) -> None:
-        """Adds the finding for the claim of this id; the other fields are those of Finding.
+        """Adds the finding for the claim of this id; the other fields are those of `Finding`.
 
-        Numbers may be numpy's, lists numpy arrays. n is the number of seeds unless it is given.
+        Numbers may be numpy scalars and lists numpy arrays. By default, n is the number of seeds.
 
-        Raises UserError, one line with the id, for an id that is not this notebook's or was added already, an
-        unknown field, a value that is not finite or not shaped like the paper's, an interval upside down, and
-        a missing holds where the check is only in words.
+        Raises a one-line UserError with the id for an id that belongs to another notebook or was already added, an
+        unknown field, a value that is not finite or not shaped like the paper's, an inverted interval, and a missing
+        `holds` where the check exists only in words.
         """
         where = f"{self.notebook}: {name}"
         if name not in self.claims:
             raise UserError(f"{where} is not one of its claims; they are {', '.join(self.claims)}")
         if name in self.found:
-            raise UserError(f"{where} was added already")
+            raise UserError(f"{where} was already added")
         count = len(seeds) if n is None and seeds is not None else n
         entry = {key: _plain(item) for key, item in dict(value=value, seeds=seeds, n=count, **fields).items()}
         for key, item in entry.items():
@@ -245,18 +244,18 @@ class Findings:
     def write(self, pending: Collection[str] = ()) -> Path:
         """Writes the results file, whole or not at all, and returns its path.
 
-        pending  ids of sections that this notebook or this profile does not have; they read 'not run'
+        pending  ids that this notebook does not compute or this profile leaves out; they read 'not run'
 
-        Raises UserError when an id of this notebook is neither there nor pending, or both, when a pending one
-        is not its own, and when the file cannot be written.
+        Raises UserError if an id of this notebook is neither found nor pending, or both, if a pending id belongs to
+        another notebook, and if the file cannot be written.
         """
         for name in pending:
             if name not in self.claims or name in self.found:
                 reason = "was added" if name in self.found else "is not one of its claims"
-                raise UserError(f"{self.notebook}: {name} is given as pending but {reason}")
+                raise UserError(f"{self.notebook}: {name} is listed as pending but {reason}")
         missing = [name for name in self.claims if name not in self.found and name not in pending]
         if missing:
-            raise UserError(f"{self.notebook}: no finding for {', '.join(missing)}; add it or call it pending")
+            raise UserError(f"{self.notebook}: no finding for {', '.join(missing)}; add it or list it as pending")
         entries = {
             name: self.found[name].model_dump() | {"verdict": verdict(claim, self.found[name], self.profile)}
             for name, claim in self.claims.items()
@@ -271,24 +270,26 @@ class Findings:
 
 
 def _plain(item: Any) -> Any:
-    """numpy's scalars and arrays as Python's, also inside a list."""
+    """Numpy scalars and arrays as Python's own, also inside a list."""
     if isinstance(item, (list, tuple)):
         return [_plain(part) for part in item]
     return item.tolist() if hasattr(item, "tolist") else item
 
 
 def _check_shape(claim: Claim, finding: Finding, where: str) -> None:
-    """The value must be comparable with the paper's; words need a test where only a test can judge them."""
+    """Raises UserError unless value and interval have shapes that fit the paper's and every needed test is there."""
     ours, paper = numbers(finding.value), numbers(claim.paper)
     alike = isinstance(finding.value, str) if paper is None else ours and len(paper) in (1, len(ours))
     if not alike:
         raise UserError(f"{where}: value {finding.value!r} is not comparable with the paper's {claim.paper!r}")
     if claim.judged_in_words and finding.holds is None:
-        raise UserError(f"{where}: holds must be True or False, its check is only in words: {claim.check}")
+        raise UserError(f"{where}: holds must be True or False, because its check is only in words: {claim.check}")
     if finding.low is None and finding.high is None:
         return
     if finding.low is None or finding.high is None:
         raise UserError(f"{where}: low and high go together, got {finding.low} and {finding.high}")
     lows, highs = numbers(finding.low), numbers(finding.high)
     if not len(lows) == len(highs) == len(ours or ()) or any(map(operator.gt, lows, highs)):
-        raise UserError(f"{where}: expected low <= high a number of the value, got {finding.low}, {finding.high}")
+        raise UserError(
+            f"{where}: expected low <= high for each number of the value, got {finding.low}, {finding.high}"
+        )

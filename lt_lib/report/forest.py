@@ -1,4 +1,4 @@
-"""The scoreboard as one picture: the paper's value and ours for every measured claim that is a number."""
+"""The scoreboard as one figure: the paper's value and ours for every measured claim that is a number."""
 
 import textwrap
 from collections.abc import Mapping
@@ -12,21 +12,21 @@ from matplotlib.lines import Line2D
 from lt_lib.report.claims import JUDGED, NOT_RUN, Claim, Number, numbers
 from lt_lib.report.scoreboard import MARKS, Mark, shown, stamp, summary, told
 
-ROW = 0.23  # inches a claim
-SPREAD = 0.4  # rows that the components of a list take
-WORDS = 78  # letters of a claim's words beside its row
-WIDEST = 2.5  # right end of the ratio axis; what lies beyond is drawn as an arrow there
+ROW = 0.23  # inches per claim
+SPREAD = 0.4  # rows spanned by the components of a list
+WORDS = 78  # characters of a claim's text beside its row
+WIDEST = 2.5  # right end of the ratio axis; an arrow there marks whatever lies beyond
 PAPER = Line2D([], [], marker="D", color="black", mfc="white", ls="", ms=6, label="paper")
 
 
 def figure(board: pd.DataFrame, claims: Mapping[str, Claim], profile: str) -> Figure:
-    """Paper (hollow diamond) against ours (filled, with its 95% interval), grouped by notebook.
+    """The paper's values (hollow diamonds) and ours (filled, with 95% intervals), grouped by notebook.
 
-    The upper panel holds proportions, on 0 to 1; the lower one everything else, as ours / paper. Components
-    of a list share a row, one below the other. A profile that gives no verdicts is stamped across.
+    The upper panel holds proportions on an axis from 0 to 1, the lower one everything else as ours / paper. Components
+    of a list share a row, one below the other. A stamp crosses the figure if the profile gives no verdicts.
 
-    board   of `scoreboard.join`
-    claims  those the board was made from: their units tell the panels apart
+    board   from `scoreboard.join`
+    claims  those that the board was made from; their units separate the panels
     """
     rows = board[(board.kind == "measured") & board.id.map(lambda name: numbers(claims[name].paper) is not None)]
     units = rows.id.map(lambda name: claims[name].unit)
@@ -50,7 +50,7 @@ def figure(board: pd.DataFrame, claims: Mapping[str, Claim], profile: str) -> Fi
 
 
 def _forest(axes: Axes, rows: pd.DataFrame) -> None:
-    """One panel: a heading a notebook, a row a claim, both values in figures at the right."""
+    """Draws one panel: a heading per notebook, a row per claim, and both values in figures on the right."""
     labels, bold = [], []
     for notebook, part in rows.groupby("notebook"):
         bold.append(len(labels))
@@ -69,11 +69,11 @@ def _forest(axes: Axes, rows: pd.DataFrame) -> None:
 
 
 def _claim(axes: Axes, row: Mapping[str, Any], y: Number) -> None:
-    """The diamonds, dots, intervals and figures of one claim."""
+    """Draws the diamonds, dots, intervals and figures of one claim."""
     mark = MARKS[row["verdict"]]
     papers = _components(row["paper"])
     ours = _components(row["ours"])
-    if len(papers) < len(ours):  # cases of ours beside one number
+    if len(papers) < len(ours):  # several cases of ours beside one number of the paper
         papers = papers * len(ours)
     lows, highs = _components(row["low"]), _components(row["high"])
     for i, paper in enumerate(papers):
@@ -95,14 +95,14 @@ def _dot(axes: Axes, x: Number, y: Number, mark: Mark) -> None:
 
 
 def _components(value: Any) -> tuple[Number, ...]:
-    """The numbers of a board's cell; none where it is empty."""
+    """The numbers in a cell of the board; none if it is empty."""
     if value is None:
         return ()
     return numbers(tuple(value) if isinstance(value, list) else value)
 
 
 def _place(value: Number, paper: Number, row: Mapping[str, Any]) -> Number:
-    """Where a number stands on its panel's axis: itself, or its ratio to the paper's (0 over 0 is 1)."""
+    """A number's place on its panel's axis: the number itself, or its ratio to the paper's (0 over 0 is 1)."""
     if not row["unit"]:
         return value
     if paper == 0:
@@ -111,7 +111,7 @@ def _place(value: Number, paper: Number, row: Mapping[str, Any]) -> Number:
 
 
 def _legend(axes: Axes, board: pd.DataFrame) -> None:
-    """What the marks mean, those that the board has, above the upper panel."""
+    """Explains the marks that occur on the board, above the upper panel."""
     kinds = [kind for kind in MARKS if (board.verdict == kind).any() and kind != NOT_RUN]
     handles = [
         Line2D([], [], marker=MARKS[kind].marker, color=MARKS[kind].colour, lw=1.6, ms=7, label=told(kind))

@@ -1,4 +1,4 @@
-"""The table of the freeze gates, for whichever encoder they were measured on."""
+"""The table of the freeze gates, for any encoder."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +16,7 @@ WORDS = {
 
 
 def table(reports: Mapping[str, Mapping[str, Any]], thresholds: Mapping[str, float]) -> pd.DataFrame:
-    """Gates down, encoders across, with the pre-registered thresholds."""
+    """One row per gate and one column per encoder, with the preregistered thresholds in the last column."""
     rows = dict(reports) | {"must reach": thresholds}
     columns = {name: {words: each.get(key) for key, words in WORDS.items()} for name, each in rows.items()}
     return pd.DataFrame(columns, dtype=float).dropna(how="all").round(3)

@@ -1,7 +1,7 @@
-"""The outputs of a profile as web pages that need no network: `python -m lt_lib.report.html --outputs outputs/full`.
+"""A profile's outputs as web pages that need no network: `python -m lt_lib.report.html --outputs outputs/full`.
 
-<outputs>/report/index.html has the scoreboard, the figures and a link to every executed notebook, one page each.
-Every page holds its pictures, so that the folder can be copied anywhere.
+<outputs>/report/index.html shows the scoreboard and the figures, and links to one page per executed notebook. Every
+page embeds its pictures, so the folder can be copied anywhere.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from lt_lib.report.scoreboard import MARKS, told
 from lt_lib.settings.base import ROOT, UserError
 from lt_lib.store.files import writable_folder, write_atomically
 
-# What nbconvert would load from the network goes: no notebook here has widgets, diagrams or LaTeX.
+# This drops whatever nbconvert would load from the network: no notebook here has widgets, diagrams or LaTeX.
 PAGE = """
 {%- extends 'lab/index.html.j2' -%}
 {%- macro picture(kind, output, resources) -%}
@@ -51,14 +51,14 @@ td, th { text-align: left; vertical-align: top } td.verdict { font-weight: bold;
 
 
 def write_report(outputs: Path) -> Path:
-    """Writes the pages of an outputs folder; returns the index.
+    """Writes the pages for an output folder and returns the path of the index.
 
-    Raises UserError where there is no scoreboard yet, or the folder cannot be written.
+    Raises UserError if there is no scoreboard yet or if the folder cannot be written.
     """
     board, manifest = outputs / "scoreboard.md", outputs / "manifest.json"
     for needed in (board, manifest):
         if not needed.is_file():
-            raise UserError(f"{needed} is missing; run_all.py makes it")
+            raise UserError(f"{needed} is missing; run_all.py writes it")
     folder = outputs / "report"
     writable_folder(folder)
     notebooks = sorted((outputs / "notebooks").glob("*.ipynb"))
@@ -78,7 +78,7 @@ def _exporter() -> HTMLExporter:
 
 
 def index(manifest: Mapping[str, Any], names: Sequence[str], board: str, figures: Path) -> str:
-    """The first page, from run_all.py's manifest, the executed notebooks' names and scoreboard.md."""
+    """The first page, from run_all.py's manifest, the names of the executed notebooks and scoreboard.md."""
     title = f"Latent Telepathy, profile {html.escape(manifest['profile'])}"
     pictures = "".join(_figure(path, names) for path in sorted(figures.glob("*")) if path.suffix in PICTURES)
     return f"""<!DOCTYPE html>
@@ -100,7 +100,7 @@ def _told(facts: Mapping[str, Any]) -> str:
 
 
 def _listing(entries: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
-    """How every notebook went, each linked to its page where it has one."""
+    """Status and time of every notebook, each linked to its page if it has one."""
     rows = "".join(
         f"<tr><td>{_linked(name, names)}</td><td>{entry['status']}</td><td>{entry['seconds']:,.0f} s</td></tr>"
         for name, entry in sorted(entries.items())
@@ -113,7 +113,7 @@ def _linked(name: str, names: Sequence[str]) -> str:
 
 
 def _scoreboard(board: str, names: Sequence[str]) -> str:
-    """scoreboard.md as HTML one heading lower, notebooks linked, verdicts in their colours."""
+    """scoreboard.md as HTML, one heading level lower, with linked notebooks and coloured verdicts."""
     page = markdown2html(re.sub(r"^#", "##", board, flags=re.MULTILINE))
     for name in names:
         page = re.sub(rf"(<h3[^>]*>){name}", rf"\1{_linked(name, names)}", page)
@@ -125,7 +125,7 @@ def _scoreboard(board: str, names: Sequence[str]) -> str:
 
 
 def _figure(path: Path, names: Sequence[str]) -> str:
-    """A picture with its name, linked to the notebook that has its number."""
+    """A figure with its name, linked to the notebook that its number names."""
     source = f"data:{PICTURES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
     maker = next((name for name in names if name[:2] == path.stem[:2]), "09_scoreboard")
     return f"""<figure><img src="{source}" alt="{path.stem}">
@@ -134,7 +134,7 @@ def _figure(path: Path, names: Sequence[str]) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command line; returns the exit status, 2 for a folder that holds no outputs."""
+    """Runs the command line and returns the exit status: 2 for a folder without outputs, otherwise 0."""
     parser = argparse.ArgumentParser(prog="python -m lt_lib.report.html", description=__doc__.splitlines()[0])
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "full", metavar="DIR")
     try:

@@ -1,4 +1,4 @@
-"""The scoreboard: every claim of the paper beside what the notebooks found, as a table and as text."""
+"""The scoreboard: every claim of the paper beside what the notebooks found, as a table and as Markdown."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -26,12 +26,12 @@ from lt_lib.settings.base import Settings, UserError
 from lt_lib.settings.profiles import explain
 from lt_lib.store.files import content_digest, writable_folder, write_atomically
 
-DISCUSSED = "discussed in"  # the notebook that says what was tried, and what the likeliest cause is
+DISCUSSED = "discussed in"  # the notebook that says what was tried and what the likeliest cause is
 COLUMNS = ["id", "notebook", "what", "kind", "paper", "ours", "low", "high", "n", "test", "p", "verdict"]
 
 
 class Mark(NamedTuple):
-    """How a verdict looks. Colours are Okabe and Ito's; shape and sign tell it without them."""
+    """How a verdict looks. Colours are Okabe and Ito's; shape and sign identify it without colour."""
 
     colour: str
     marker: str
@@ -48,22 +48,22 @@ MARKS = {
 }
 LEGEND = """\
 Verdicts: ✔ **reproduced** - exact numbers print alike, settings are equal, measured values lie within the
-margin that `params/claims.yaml` fixed beforehand (or meet the check stated there) and the claim's own test
-holds; ≈ **same direction** - the test holds, outside the margin; ✘ **not reproduced** - the test fails, or there
-is none and the value is outside the margin; ◌ **surrogate** - made with a simulated camera where the paper used
-the robot's; · **not run** - no finding. A rank test holds when no seed overlaps those that it is compared with.
-A scene number whose check is 'reported' depends on geometry that the paper does not print: it only has to
-stand beside the paper's."""
+margin that `params/claims.yaml` fixed beforehand (or meet the check stated there), and the claim's own test
+holds; ≈ **same direction** - the test holds, but the value lies outside the margin; ✘ **not reproduced** - the
+test fails, or there is no test and the value lies outside the margin; ◌ **surrogate** - made with a simulated
+camera where the paper used the robot's; · **not run** - no finding. A rank test holds if no seed overlaps the
+seeds it is compared with. A scene number whose check is 'reported' depends on geometry that the paper does not
+print, so it only has to stand beside the paper's."""
 
 
 class _Entry(Finding):
-    """A finding as its file holds it. The verdict there is for readers; the board judges anew."""
+    """A finding as stored in its file. The verdict there is for readers; the scoreboard judges anew."""
 
     verdict: str
 
 
 class _Results(Settings):
-    """What a notebook wrote at its end."""
+    """The results file that a notebook writes at its end."""
 
     notebook: str
     profile: str
@@ -72,11 +72,11 @@ class _Results(Settings):
 
 
 def read_findings(outputs: Path, claims: Mapping[str, Claim], profile: str) -> dict[str, Finding]:
-    """The findings of every results file under an outputs folder, by claim id.
+    """The findings of every results file under an output folder, by claim id.
 
-    Raises UserError, one line with file and id, for a file that cannot be read or is of another notebook or
-    profile, an id in two files, an id that is unknown or belongs to another notebook, and a notebook that
-    lacks one of its ids without calling it pending.
+    Raises a one-line UserError with file and id for a file that cannot be read or comes from another notebook or
+    profile, an id in two files, an id that is unknown or belongs to another notebook, and a notebook that lacks one of
+    its ids without listing it as pending.
     """
     files = [_read_results(path, profile) for path in sorted((Path(outputs) / "results").glob("*.json"))]
     owners: dict[str, str] = {}
@@ -94,17 +94,17 @@ def read_findings(outputs: Path, claims: Mapping[str, Claim], profile: str) -> d
         known = {*results.findings, *results.pending}
         lacking = [name for name, claim in claims.items() if claim.nb == results.notebook and name not in known]
         if lacking:
-            raise UserError(f"{results.notebook}.json: no finding for {', '.join(lacking)}, which is not pending")
+            raise UserError(f"{results.notebook}.json: no finding for {', '.join(lacking)}, and not listed as pending")
     return {name: finding for results in files for name, finding in results.findings.items()}
 
 
 def _read_results(path: Path, profile: str) -> _Results:
-    """One results file, checked by itself."""
+    """Reads one results file and checks it by itself."""
     try:
         content = dict(json.loads(path.read_bytes()))
-        expected = content.pop("sha256", None)  # files of before it was kept have none
+        expected = content.pop("sha256", None)  # older files have none
         if expected not in (None, content_digest(content)):
-            raise UserError(f"{path.name}: is altered (it differs from its checksum); run its notebook again")
+            raise UserError(f"{path.name}: was altered (its checksum differs); run its notebook again")
         results = _Results(**content)
     except ValidationError as error:
         raise UserError(explain(error, path.name, _Results)) from None
@@ -113,12 +113,12 @@ def _read_results(path: Path, profile: str) -> _Results:
     if results.notebook != path.stem:
         raise UserError(f"{path.name}: was written by {results.notebook}")
     if results.profile != profile:
-        raise UserError(f"{path.name}: made with profile {results.profile}, this scoreboard is of {profile}")
+        raise UserError(f"{path.name}: made with profile {results.profile}, but this scoreboard is for {profile}")
     return results
 
 
 def join(claims: Mapping[str, Claim], findings: Mapping[str, Finding], profile: str) -> pd.DataFrame:
-    """One row a claim, in the order of claims.yaml, with exactly the columns COLUMNS; lists stay lists."""
+    """The board: one row per claim in the order of claims.yaml, with exactly the columns COLUMNS; lists stay lists."""
     rows = [_row(claim, findings.get(name), profile) for name, claim in claims.items()]
     return pd.DataFrame(rows, columns=COLUMNS, dtype=object)
 
@@ -144,7 +144,7 @@ def _as_list(value: Any) -> Any:
 
 
 def deviations(board: pd.DataFrame, findings: Mapping[str, Finding]) -> pd.DataFrame:
-    """The rows that did not come out as in the paper, not reproduced ones first, with notes and where they are told."""
+    """The rows that depart from the paper, not reproduced first, with notes and the notebook that discusses each."""
     rows = [board[board.verdict == kind] for kind in (NOT_REPRODUCED, SAME_DIRECTION)]
     part = pd.concat(rows)[["id", "what", "paper", "ours", "low", "high", "test", "p", "verdict", "notebook"]]
     notes = [findings[name].note for name in part.id]
@@ -152,7 +152,7 @@ def deviations(board: pd.DataFrame, findings: Mapping[str, Finding]) -> pd.DataF
 
 
 def summary(board: pd.DataFrame) -> str:
-    """One line, e.g. '61 reproduced, 3 same direction, 2 not reproduced, 80 not run, of 146'."""
+    """The verdicts in one line, e.g. '61 reproduced, 3 same direction, 2 not reproduced, 80 not run, of 146'."""
     counts = board.verdict.value_counts()
     names = {NO_VERDICT: "without a verdict"}
     parts = [f"{counts[kind]} {names.get(kind, kind)}" for kind in MARKS if kind in counts]
@@ -160,7 +160,7 @@ def summary(board: pd.DataFrame) -> str:
 
 
 def stamp(board: pd.DataFrame, profile: str) -> str:
-    """What stands on every table and picture that is not at the paper's scale; '' for the full profile."""
+    """The stamp on every table and figure below the paper's scale; '' for the full profile."""
     sizes = [int(n) for n in board.n.dropna()]
     n = f"n = {min(sizes)} to {max(sizes)}" if sizes else "no findings"
     if profile == "full":
@@ -169,14 +169,14 @@ def stamp(board: pd.DataFrame, profile: str) -> str:
 
 
 def headline(board: pd.DataFrame) -> str:
-    """Markdown table of the route optimality of every message (Table III), for the README."""
+    """Markdown table of route optimality by message content (Table III), for the README."""
     rows = board[board.id.str.fullmatch(r"px\.\w+\.route")]
     rows = rows.assign(message=rows.what.str.removeprefix("route optimality - "))
     return _table(rows, ["message", "n", "paper", "ours", "p", "verdict"])
 
 
 def markdown(board: pd.DataFrame, findings: Mapping[str, Finding], profile: str) -> str:
-    """The whole board as markdown: summary, stamp, legend, deviations with notes, a table a notebook."""
+    """The whole board as Markdown: summary, stamp, legend, deviations with notes, one table per notebook."""
     mark = stamp(board, profile)
     parts = ["# Scoreboard", f"**{summary(board)}**", *([f"**{mark}**"] if mark else []), LEGEND]
     unlike = deviations(board, findings)
@@ -190,7 +190,7 @@ def markdown(board: pd.DataFrame, findings: Mapping[str, Finding], profile: str)
 
 
 def _table(rows: pd.DataFrame, columns: Sequence[str]) -> str:
-    """A markdown table; `ours` carries its interval, the verdict its sign."""
+    """A Markdown table; `ours` carries its interval and the verdict its sign."""
     lines = [columns, ["---"] * len(columns)]
     lines += [[_cell(row, column) for column in columns] for row in rows.to_dict("records")]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -208,12 +208,12 @@ def _cell(row: Mapping[str, Any], column: str) -> str:
 
 
 def told(kind: str) -> str:
-    """A verdict with its sign; where there is none, the word that says why."""
+    """A verdict with its sign; without a verdict, the word that says why."""
     return f"{MARKS[kind].sign} {kind or 'smoke'}"
 
 
 def shown(value: Any) -> str:
-    """A value as people read it: four significant digits, lists component by component, nothing for None."""
+    """A value for readers: four significant digits, lists component by component, nothing for None."""
     if value is None:
         return ""
     if isinstance(value, (list, tuple)):
@@ -224,7 +224,7 @@ def shown(value: Any) -> str:
 
 
 def styled(rows: pd.DataFrame, board: pd.DataFrame, profile: str) -> Styler:
-    """Some rows of a board for display in a notebook: verdicts in colour, the board's stamp above."""
+    """Some rows of a board for display in a notebook, with coloured verdicts under the board's stamp."""
     colours = {kind: f"color: {mark.colour}; font-weight: bold" for kind, mark in MARKS.items()}
     rows = rows.drop(columns="notebook", errors="ignore")
     return (
@@ -238,13 +238,13 @@ def styled(rows: pd.DataFrame, board: pd.DataFrame, profile: str) -> Styler:
 
 
 def own(findings: Findings) -> Styler:
-    """What one notebook found, for its own reader: its rows of the scoreboard."""
+    """One notebook's rows of the scoreboard, for display at its end."""
     board = join(findings.claims, findings.found, findings.profile)
     return styled(board[board.id.isin(findings.found)], board, findings.profile)
 
 
 def write(board: pd.DataFrame, findings: Mapping[str, Finding], outputs: Path, profile: str) -> None:
-    """Writes scoreboard.csv and scoreboard.md, each whole; UserError where they cannot be written."""
+    """Writes scoreboard.csv and scoreboard.md, each whole or not at all; raises UserError if they cannot be written."""
     writable_folder(Path(outputs))
     write_atomically(Path(outputs) / "scoreboard.csv", board.to_csv(index=False).encode())
     write_atomically(Path(outputs) / "scoreboard.md", markdown(board, findings, profile).encode())

@@ -1,4 +1,4 @@
-"""What all figures share: colours by role, the stamp of a size that gives no results, and where they are kept."""
+"""What all figures share: colours by role, the stamp of sizes that give no results, and the folder."""
 
 from pathlib import Path
 from textwrap import fill
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from lt_lib.report.claims import JUDGED
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart
+# Okabe and Ito's palette, which colour-blind readers can distinguish
 ROLES = {
     "ours": "#0072B2", "diagnostic": "#009E73", "upper bound": "#E69F00",
     "lower bound": "#666666", "kinematic": "#CC79A7",
@@ -19,6 +19,7 @@ DPI = 130
 
 
 def chance_line(axes: Axes, level: float = 0.5) -> None:
+    """Draws the dotted line of chance at `level`."""
     axes.axhline(level, label="chance", **CHANCE)
 
 
@@ -28,10 +29,10 @@ def wrapped(words: str) -> str:
 
 
 def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str) -> Image:
-    """Says at the bottom what the figure is made of, stamps a smoke-sized one, saves it as a PNG and shows that.
+    """Captions a figure, stamps it if it is smoke-sized, saves it as a PNG and returns the image for display.
 
-    made_of  e.g. 'n = 5 seeds a condition, last 500 of 6,000 episodes'
-    name     of the file in <outputs>/figures, e.g. '04_routes'
+    made_of  what the figure shows, e.g. 'n = 5 seeds per condition, last 500 of 6,000 episodes'
+    name     file name in <outputs>/figures, e.g. '04_routes'
     """
     figure.supxlabel(f"profile {profile}; {made_of}", fontsize=8, color="0.35")
     if profile not in JUDGED:
