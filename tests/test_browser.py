@@ -18,6 +18,8 @@ from lt_lib.report.html import PICTURES, main, write_report
 from lt_lib.report.readme import FULL
 from lt_lib.settings.base import ROOT
 
+pytestmark = pytest.mark.slow
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 LIMIT_S = 600
 TOKEN = "of-this-test"

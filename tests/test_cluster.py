@@ -22,6 +22,8 @@ from lt_lib.store.run import Run
 from lt_lib.store.runs import RunError, RunStore
 from run_all import main
 
+pytestmark = pytest.mark.slow
+
 
 def dask(*arguments: str, library: Path = ROOT) -> subprocess.Popen:
     """A process of Dask that finds our library in a folder, the tests' runs, and too many threads."""

@@ -480,6 +480,8 @@ def test_signals_that_only_unix_has_are_not_needed():
     code = """import signal
 del signal.SIGHUP
 import run_all
+
+pytestmark = pytest.mark.slow
 with run_all.ended_by_signals():
     print(run_all.SIGNALS)"""
     assert python(code).stdout == "[<Signals.SIGTERM: 15>]\n"

@@ -16,6 +16,8 @@ from lt_lib.report.claims import load_claims
 from lt_lib.settings.base import ROOT
 from lt_lib.settings.profiles import notebook_names
 
+pytestmark = pytest.mark.slow
+
 COMMAND = [sys.executable, "run_all.py", "--profile", "smoke"]
 LIMIT_S = 1200  # a slow machine with other work
 NEEDED = ("run_all.py", "requirements.txt", "lt_lib", "notebooks", "params")
