@@ -11,8 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lt_lib.envs.layout import SIDES
+from lt_lib.gridworld.board import board, patch
 from lt_lib.gridworld.episodes import read_actor
-from lt_lib.gridworld.figures import board, patch
 from lt_lib.gridworld.map import Grid
 from lt_lib.gridworld.mappo import Actor, Inputs
 from lt_lib.gridworld.patches import FrozenPatchEncoder
@@ -25,7 +25,7 @@ ARROWS = ("stay", "right", "left", "up", "down")
 
 
 def film(grid: Grid, policy: Result, encoder: Result, content: str, start: int, slab: int, path: Path) -> Path:
-    """Films a greedy episode from a spawn cell with the slab in one corridor; one picture a step."""
+    """Films a greedy episode from a spawn cell with the slab in one corridor; one picture per step."""
     inputs, actor = Inputs.of(grid, FrozenPatchEncoder(encoder), content), read_actor(policy)
     cell, pictures = start, []
     for step in range(LONGEST):
@@ -42,7 +42,7 @@ def film(grid: Grid, policy: Result, encoder: Result, content: str, start: int, 
 
 @torch.no_grad()
 def _decide(inputs: Inputs, actor: Actor, row, loudness: float) -> tuple[Float[np.ndarray, "5"], float]:
-    """Action probabilities with the message's content scaled by `loudness`, and the attention that it gets."""
+    """Action probabilities with the message's content scaled by `loudness`, and the attention it gets."""
     message, cell, slab = row.unbind(1)
     wires, present = inputs.wires(row)[:, None].clone(), inputs.present[message, cell][:, None]
     wires[..., inputs.anchors.shape[-1] :] *= loudness
