@@ -99,7 +99,7 @@ cells = {cell["id"]: "".join(cell["source"]) for cell in json.load(open("noteboo
 imports = cells["c02"][: cells["c02"].index("require_opengl()")]
 there = {
     "protocol": SimpleNamespace(trained_heads=lambda *_: trained, sizes=PixelsConfig()),
-    "seeds": seeds, "episodes": None, "frozen_encoder": None, "profile": "smoke",
+    "seeds": seeds, "episodes": None, "encoder_weights": None, "profile": "smoke",
     "folder": Path("outputs/smoke"), "findings": Findings("04_pixels", Path("outputs/smoke"), "smoke"),
 }
 for code in (imports, cells["c12a"], cells["c12"]):

@@ -48,7 +48,7 @@ def pixel_runs(pixels: dict, seeds: dict, layout: str) -> tuple[PixelProtocol, R
     store = Recorder()
     protocol = with_store(PixelProtocol.of(pixels, layout, "cpu", 0), store)
     protocol.gate_reports(protocol.encoders())
-    protocol.frozen_executor({})
+    protocol.executor_weights({})
     protocol.episode_bank({}, {})
     protocol.trained_heads(seeds, {}, {})
     protocol.redrawn_heads(seeds, dict.fromkeys(SCENES, 0), {}, {})
@@ -120,7 +120,7 @@ def test_every_gridworld_setting_of_a_profile_reaches_its_runs(profile):
 def test_every_velocity_setting_of_a_profile_reaches_its_runs(profile):
     given, store = load_profile(profile)["05_coverage_sweep"], Recorder()
     pixels = PixelProtocol.of({"latency": 3}, "wide", "cpu", 0)
-    object.__setattr__(pixels, "frozen_encoder", dict)
+    object.__setattr__(pixels, "encoder_weights", dict)
     study = with_store(DirectTransfer.of(pixels, given["navigator"], given["rollout"]), store)
     study.examined(study.navigators(given["configurations"], given["oracle_seeds"]))
     assert_arrives(given["navigator"], store.configs("train_navigator"), "navigator")

@@ -15,6 +15,7 @@ from lt_lib.gridworld.patches import FrozenPatchEncoder
 from lt_lib.gridworld.walks import States, first_states
 from lt_lib.settings.base import LATENCY
 from lt_lib.settings.gridworld import GridEvaluationConfig
+from lt_lib.settings.streams import Stream
 from lt_lib.store.states import restored
 
 Choice = Callable[[Float[Tensor, "n 5"], np.random.Generator], Int[np.ndarray, " n"]]
@@ -51,7 +52,7 @@ def evaluate_grid(
     inputs = Inputs.of(grid, FrozenPatchEncoder(encoder), config.content)
     actor, result = read_actor(policy), {}
     for name, choose in CHOICES.items():
-        rng = np.random.default_rng([seed, 9])
+        rng = Stream.GRID_EVALUATION.generator(seed)
         starts = first_states(grid, config.episodes, rng)
         cells = play(grid, inputs, actor, starts, config.wire, choose, rng, config.latency)
         arrived = grid.goal[cells]

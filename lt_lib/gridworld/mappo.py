@@ -27,6 +27,7 @@ from lt_lib.gridworld.wires import anchors, contents_sent
 from lt_lib.perception.encoder import LATENT
 from lt_lib.settings.gridworld import GridConfig
 from lt_lib.settings.ppo import PpoConfig
+from lt_lib.settings.streams import Stream
 from lt_lib.store.states import state_of
 
 WIDTH = 64  # of every hidden layer
@@ -141,7 +142,7 @@ def train_grid(
     "ended"                     (updates,) episodes that had ended after each update's rollout
     "entropy", "value_loss"     (updates,) nats, squared reward
     """
-    grid, rng = Grid(load_layout(config.layout)), np.random.default_rng([seed, 8])
+    grid, rng = Grid(load_layout(config.layout)), Stream.GRID_POLICY.generator(seed)
     inputs = Inputs.of(grid, FrozenPatchEncoder(encoder), config.content)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

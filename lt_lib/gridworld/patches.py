@@ -18,6 +18,7 @@ from lt_lib.gridworld.map import CODES, MOVES, PATCH, Grid
 from lt_lib.perception.encoder import LATENT, Frozen
 from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 from lt_lib.settings.gridworld import PatchEncoderConfig
+from lt_lib.settings.streams import Stream
 
 SHARES = 1_000  # walks whose views tell how common each code is
 
@@ -66,7 +67,7 @@ def train_patch_encoder(config: PatchEncoderConfig, seed: int, *, report: Callab
     "E.*", "P.*"  weights;  "mean", "std" (64,) of the latent over the training patches
     "loss.*"      (updates,) each term before weighting
     """
-    grid, rng = Grid(load_layout(config.layout)), np.random.default_rng([seed, 6])
+    grid, rng = Grid(load_layout(config.layout)), Stream.PATCH_ENCODER.generator(seed)
     walk = random_walks(grid, config.frames // config.rollout, config.rollout, rng)
     rows = walk.cells * len(SIDES) + walk.slab[:, None]  # of the table of patches
     table = grid.patches.reshape(-1, PATCH, PATCH)

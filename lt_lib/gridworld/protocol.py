@@ -62,7 +62,7 @@ class GridProtocol:
         runs = [Run(measure_patch_gates, config, SEED, {"encoder": encoder}) for encoder in encoders.values()]
         return dict(zip(encoders, self.store.fetch(runs, "patch gates"), strict=True))
 
-    def frozen_encoder(self) -> Result:
+    def encoder_weights(self) -> Result:
         """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
         trained = self.trained_encoder()
         require_patch_gates(self.gate_reports({OURS: trained})[OURS], self.gates)

@@ -22,6 +22,7 @@ from lt_lib.perception.jepa import GRID, LEVELS
 from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 from lt_lib.settings.base import UserError
 from lt_lib.settings.hardware import HardwareGates, MatchedEncoderConfig, MatchedGateConfig
+from lt_lib.settings.streams import Stream
 
 SAMPLE = 2_048  # frames that the class weights and the normalisation are taken from
 
@@ -54,7 +55,7 @@ def train_matched_encoder(config: MatchedEncoderConfig, seed: int, *, report: Ca
     "E.*", "P.*"  weights;  "mean", "std" (64,) of the latent over training frames
     "loss.*"      (updates,) each term before weighting
     """
-    rng = np.random.default_rng([seed, 8])
+    rng = Stream.MATCHED_ENCODER.generator(seed)
     layout = load_layout(config.layout)
     rollouts = random_rollouts(layout, config.frames // config.rollout, config.rollout, rng)
     looks = draw_appearances(len(rollouts.frames), layout.camera.pixels, config.colour, config.texture, rng)
@@ -95,7 +96,7 @@ def measure_matched_gates(
     config: MatchedGateConfig, seed: int, *, report: Callable[[float], None], encoder: Mapping[str, np.ndarray]
 ) -> dict:
     """The fields of `Shown` for one checkpoint, probes fitted on 70% of the rollouts and scored on the others."""
-    rng = np.random.default_rng([seed, 9])
+    rng = Stream.MATCHED_GATES.generator(seed)
     layout = load_layout(config.layout)
     rollouts = random_rollouts(layout, config.rollouts, config.length, rng)
     looks = draw_appearances(config.rollouts, layout.camera.pixels, config.colour, config.texture, rng)

@@ -29,6 +29,7 @@ from lt_lib.settings.hardware import (
 )
 from lt_lib.settings.pixels import ExecutorConfig
 from lt_lib.settings.profiles import validated
+from lt_lib.settings.streams import Stream
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -151,7 +152,7 @@ class HardwareProtocol:
 def past_the_rails(config: RailsConfig, encoder: Result, executor: Result) -> Float[np.ndarray, "routes axes"]:
     """Share of an executor's action components beyond +-1 before clipping, on frames of held-out rollouts."""
     device = config.device
-    rng = np.random.default_rng([SEED, 13])
+    rng = Stream.RAILS.generator(SEED)
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
     latents = torch.from_numpy(encode(FrozenEncoder(encoder, device), rollouts.frames)).flatten(0, 1).to(device)
     driver = FrozenExecutor(executor, device)

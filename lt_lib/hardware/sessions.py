@@ -13,6 +13,7 @@ from lt_lib.hardware.randomise import draw_appearances, eight_bits, recoloured
 from lt_lib.hardware.surrogate import SurrogateScene
 from lt_lib.settings.base import require_known
 from lt_lib.settings.hardware import MatchedEncoderConfig, OpticsConfig, SessionConfig, SweepConfig
+from lt_lib.settings.streams import Stream
 
 
 class Effect(NamedTuple):
@@ -56,7 +57,7 @@ def session_of(result: Mapping[str, np.ndarray]) -> Session:
 
 def film_session(config: SessionConfig, seed: int, *, report: Callable[[float], None]) -> dict:
     """The fields of `Session` from the surrogate camera, and "views" (6, 120, 160, 3), whole frames for pictures."""
-    rng = np.random.default_rng([seed, 10])
+    rng = Stream.FILM.generator(seed)
     placements = draw_placements(load_layout(config.layout), config, rng)
     taken = _expose(_pictures(config, placements, report), placements, config, rng)
     session = _labelled(np.stack([optics.crop(frame) for frame in taken]), placements, config)
@@ -68,7 +69,7 @@ def film_sweep(config: SweepConfig, seed: int, *, report: Callable[[float], None
     strengths, frames, pictures, drawn = EFFECTS[config.effect].strengths, [], [], None
     for i, strength in enumerate(strengths):
         changed = with_effect(config, config.effect, strength)
-        rng = np.random.default_rng([seed, 11])
+        rng = Stream.SWEEP.generator(seed)
         placements = draw_placements(load_layout(config.layout), changed, rng)
         if changed.bench != drawn:  # what only the camera changes need not be rendered again
             pictures, drawn = _pictures(changed, placements, report), changed.bench
@@ -123,7 +124,7 @@ def _labelled(frames, placements: Placements, config: SessionConfig) -> Session:
 
 def simulated_session(config: SessionConfig, looks: MatchedEncoderConfig, seed: int) -> Session:
     """The bench as the simulation shows it, one frame a placement, floor and walls as in an encoder's training."""
-    rng = np.random.default_rng([seed, 12])
+    rng = Stream.SIMULATED_BENCH.generator(seed)
     layout = load_layout(config.layout)
     placements = draw_placements(layout, config, rng)
     frames = simulated_frames(layout, placements)

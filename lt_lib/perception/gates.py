@@ -19,6 +19,7 @@ from lt_lib.perception.encoder import LATENT, FrozenEncoder, in_chunks
 from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixels
 from lt_lib.settings.base import UserError
 from lt_lib.settings.perception import GateConfig, Gates
+from lt_lib.settings.streams import Stream
 
 PROBE_SHARE = 0.7  # of the held-out rollouts train the probes; the rest test them
 
@@ -62,7 +63,7 @@ def measure_gates(
     Returns the fields of `Measured` and, for n = `config.shown` frames, "latent.plane" (n, 2) by t-SNE, "latent.pose"
     (n, 3) and "latent.hazard" (n,), whether the slab is visible.
     """
-    rng = np.random.default_rng([seed, 5])
+    rng = Stream.GATES.generator(seed)
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
     latents = encode(FrozenEncoder(encoder, config.device), rollouts.frames)  # (R, T, 64)
     report(0.5)

@@ -18,6 +18,7 @@ from lt_lib.perception.encoder import Encoder, in_chunks
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 from lt_lib.settings.perception import EncoderConfig
+from lt_lib.settings.streams import Stream
 
 LEVELS = 4  # quantised levels per colour channel
 GRID = 16  # cells per side of the reconstructed frame
@@ -36,7 +37,7 @@ def train_encoder(config: EncoderConfig, seed: int, *, report: Callable[[float],
     "mean", "std"  (64,) of the latent over the training frames
     "loss.*"       (updates,) each term before weighting
     """
-    rng = np.random.default_rng([seed, 0])
+    rng = Stream.ENCODER.generator(seed)
     rollouts = random_rollouts(load_layout(config.layout), config.frames // config.rollout, config.rollout, rng)
     classes = colour_classes().astype(np.int16)[cells(rollouts.frames)]  # (R, T, 16, 16)
     device = config.device

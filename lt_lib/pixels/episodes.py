@@ -16,6 +16,7 @@ from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.executor import ROUTES, FrozenExecutor
 from lt_lib.settings.pixels import BankConfig
+from lt_lib.settings.streams import Stream
 
 SLABS = 2
 ARRIVAL_REWARD = 1.0
@@ -137,7 +138,7 @@ def roll_bank(
     "commit_step" and "held_out" are the bank's, for whatever trains or evaluates on its scenes.
     """
     layout, device = load_layout(config.layout), config.device
-    draws = draw_scenes(layout, config.entries, np.random.default_rng([seed, 2]))
+    draws = draw_scenes(layout, config.entries, Stream.BANK.generator(seed))
     shape = (config.entries, SLABS, ROUTES)
     entry, slab, route = (axis.ravel() for axis in np.indices(shape))
     outcome = drive(

@@ -20,6 +20,7 @@ from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 from lt_lib.settings.pixels import ExecutorConfig
+from lt_lib.settings.streams import Stream
 
 ROUTES = 2
 FROM_SPAWN = 0.5  # share of pretraining episodes that start at the spawn
@@ -131,7 +132,7 @@ def train_executor(
 
     "curve.*" have one entry per update: obedient share of the episodes that ended, their number, entropy.
     """
-    rng = np.random.default_rng([seed, 1])
+    rng = Stream.EXECUTOR.generator(seed)
     device = config.device
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -73,7 +73,7 @@ class PixelProtocol:
         runs = [Run(measure_gates, self.sizes.probe, SEED, {"encoder": encoder}) for encoder in encoders.values()]
         return dict(zip(encoders, self.store.fetch(runs, "freeze gates"), strict=True))
 
-    def frozen_encoder(self) -> Result:
+    def encoder_weights(self) -> Result:
         """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
         trained = (
             self._kept("encoder")
@@ -86,7 +86,7 @@ class PixelProtocol:
     def _kept(self, kind: str) -> Result:
         return load_frozen(self.weights, kind, load_layout(self.layout))
 
-    def frozen_executor(self, encoder: Result) -> Result:
+    def executor_weights(self, encoder: Result) -> Result:
         """The low-level controller, pretrained behind the frozen encoder."""
         if self.weights:
             return self._kept("executor")

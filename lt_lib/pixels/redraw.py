@@ -36,6 +36,7 @@ from lt_lib.pixels.episodes import (
 from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.settings.pixels import RedrawConfig
 from lt_lib.settings.ppo import PpoConfig
+from lt_lib.settings.streams import Stream
 from lt_lib.store.states import state_of
 
 
@@ -241,7 +242,7 @@ def train_redrawn_head(
                        optimal when the corridor first entered is the slab-free one
     "entropy", "draws" (updates,) nats per draw, draws in the batch
     """
-    rng = np.random.default_rng([seed, 3])  # the scenes and the chance of `train_head` of this seed
+    rng = Stream.HEAD.generator(seed)  # the scenes and the chance of `train_head` of this seed
     commit_step = scenes["commit_step"]
     arena = LiveArena(config, commit_step, encoder, executor)
     spawn, scout = (scenes[name][held_out_draws(scenes) :] for name in ("spawn", "scout"))

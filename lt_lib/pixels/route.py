@@ -21,6 +21,7 @@ from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.episodes import SLABS, Outcomes, held_out_draws
 from lt_lib.settings.pixels import EvaluationConfig, HeadConfig
+from lt_lib.settings.streams import Stream
 from lt_lib.store.states import restored, state_of
 
 CHUNK = 1024  # frames encoded at a time
@@ -131,7 +132,7 @@ def train_head(
     "entropy" (updates,) nats, "value_loss" (updates,)
     "greedy.*"         the same four over the held-out draws, both placements each, choices greedy
     """
-    rng = np.random.default_rng([seed, 3])
+    rng = Stream.HEAD.generator(seed)
     training, held_out = read_bank(config, bank, encoder)
     width = training.contents.shape[-1]
     channel = channel_of(config, config.batch, width, rng)
@@ -207,7 +208,7 @@ def evaluate_head(
 ) -> dict:
     """One cell of Table IV: a frozen trained head under one wire condition, greedily."""
     _, held_out = read_bank(config, bank, encoder)
-    rng = np.random.default_rng([seed, 4])
+    rng = Stream.CORRUPTION.generator(seed)
     channel = channel_of(config, config.episodes, held_out.contents.shape[-1], rng)
     return evaluate(read_head(head), held_out, channel, rng)
 

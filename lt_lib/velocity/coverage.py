@@ -15,6 +15,7 @@ from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, FrozenEncoder
 from lt_lib.pixels.episodes import SLABS, draw_scenes
 from lt_lib.settings.base import LATENCY
+from lt_lib.settings.streams import Stream
 from lt_lib.settings.velocity import Boost, Exploration, RolloutConfig
 from lt_lib.velocity.navigator import LATERAL, Navigator, Scouts, read_navigator
 from lt_lib.velocity.noise import Ar1
@@ -177,7 +178,7 @@ def roll_navigator(
     Returns the arrays of `Episodes`, each (rows, episodes, ...), and "slab" (rows, episodes), the blocked corridor
     (0 left, 1 right). "path" has only the first `config.paths` episodes of each row.
     """
-    rng = np.random.default_rng([seed, 7])
+    rng = Stream.ROLLOUT.generator(seed)
     shape = (len(config.rows), config.episodes)
     fixed = None if config.blocked == "random" else SIDES.index(config.blocked)
     slab = rng.integers(0, SLABS, shape) if fixed is None else np.full(shape, fixed)

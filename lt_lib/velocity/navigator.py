@@ -22,6 +22,7 @@ from lt_lib.envs.geodesic import RouteDistance
 from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
+from lt_lib.settings.streams import Stream
 from lt_lib.settings.velocity import Boost, NavigatorConfig
 from lt_lib.store.states import restored, state_of
 from lt_lib.velocity.noise import Ar1
@@ -175,7 +176,7 @@ def train_navigator(
     "sigma" (U, 3)     the policy's own standard deviations after every update
     "boost" (U,)       factor on the lateral one in the window
     """
-    rng = np.random.default_rng([seed, 6])
+    rng = Stream.NAVIGATOR.generator(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         navigator = read_navigator(start) if start else Navigator()

@@ -81,7 +81,7 @@ class DirectTransfer:
         """
         given = validated(NavigatorConfig, "navigator", navigator), validated(RolloutConfig, "rollout", rollout)
         shared = {name: getattr(protocol.sizes.head, name) for name in ("layout", "device", "latency")}
-        return cls(protocol.store, protocol.frozen_encoder(), *(everywhere(each, shared) for each in given))
+        return cls(protocol.store, protocol.encoder_weights(), *(everywhere(each, shared) for each in given))
 
     def navigators(self, configurations: Sequence[str], oracle_seeds: int) -> dict[str, list[Result]]:
         """Trains all navigators from scratch; returns them by name: `oracle_seeds` of the oracle, one of each other."""

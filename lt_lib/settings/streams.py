@@ -1,0 +1,32 @@
+"""Random streams, one per purpose: two runs of one seed share random numbers only where they share a stream."""
+
+from enum import IntEnum, unique
+
+import numpy as np
+
+
+@unique
+class Stream(IntEnum):
+    """What random numbers are for. A number, once used, stays: another one is another result."""
+
+    ENCODER = 0
+    EXECUTOR = 1
+    BANK = 2
+    HEAD = 3  # on the bank and live: the same draws of the scene, so that both can be compared episode by episode
+    CORRUPTION = 4
+    GATES = 5
+    NAVIGATOR = 6
+    ROLLOUT = 7
+    GRID_POLICY = 8
+    GRID_EVALUATION = 9
+    FILM = 10
+    SWEEP = 11
+    SIMULATED_BENCH = 12
+    RAILS = 13
+    PATCH_ENCODER = 14
+    MATCHED_ENCODER = 15
+    MATCHED_GATES = 16
+
+    def generator(self, seed: int) -> np.random.Generator:
+        """The generator of this stream for a seed."""
+        return np.random.default_rng([seed, self.value])
