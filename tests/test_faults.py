@@ -28,6 +28,8 @@ from lt_lib.store.run import Run
 from lt_lib.store.runs import RunError, RunStore
 from run_all import code_digest
 
+pytestmark = pytest.mark.slow
+
 
 def toys(count: int, **settings) -> list[Run]:
     return [Run(train_toy, ToyConfig(**settings), seed) for seed in range(count)]
@@ -193,8 +195,6 @@ def test_a_second_run_all_on_one_outputs_folder_is_refused_by_the_first_one_s_nu
 def test_a_killed_process_claims_nothing(tmp_path):
     hold = """import pathlib, sys, time
 from lt_lib.store.files import claimed
-
-pytestmark = pytest.mark.slow
 with claimed(pathlib.Path(sys.argv[1])):
     print(1, flush=True)
     time.sleep(60)"""

@@ -17,7 +17,7 @@ SHARED = {"settings": 0, "store": 1, "envs": 2, "perception": 3, "comm": 4, "ppo
 FLOORS = SHARED | dict.fromkeys(STUDIES, 6)
 LONGEST_CELL = 36
 LONGEST_FUNCTION = 60
-SMALL_FUNCTION = 6  # lines, in a notebook
+SMALL_FUNCTION = 15  # lines, in a notebook
 LONGEST_FULL_RUN_S = 2 * 3600
 TRAIN_OR_EVALUATE = {name for name in notebook_names() if "02" <= name[:2] <= "08"}
 FOLDER = re.compile(r"(?:^|[\s'\"(=])(/(?:home|root|tmp|usr|work|Users)/[^\s'\"]*)")

@@ -33,6 +33,8 @@ from lt_lib.store.progress import read_progress, stage
 from lt_lib.store.run import Run
 from run_all import code_cells, ended_by_signals, make_plan, parse, preflight
 
+pytestmark = pytest.mark.slow
+
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 needs_git = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed here")
 needs_root = pytest.mark.skipif(getattr(os, "getuid", lambda: 1)() != 0, reason="only root can do as another user")
@@ -480,8 +482,6 @@ def test_signals_that_only_unix_has_are_not_needed():
     code = """import signal
 del signal.SIGHUP
 import run_all
-
-pytestmark = pytest.mark.slow
 with run_all.ended_by_signals():
     print(run_all.SIGNALS)"""
     assert python(code).stdout == "[<Signals.SIGTERM: 15>]\n"
