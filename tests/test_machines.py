@@ -342,6 +342,11 @@ def test_a_run_s_key_holds_the_device_that_computes_it(monkeypatch):
 # --- disks and users
 
 
+def test_no_notebook_keeps_runs_in_a_folder_of_its_own_choice():
+    for name in notebook_names():
+        assert not re.search(r"RunStore\((?!runs_folder\(\))", "\n".join(code_cells(ROOT, name))), name
+
+
 def test_runs_may_lie_elsewhere(project, tmp_path):
     assert smoke(project, "--only", "02", "--runs", str(tmp_path / "runs")) == 0
     assert len(losses(project, "02_encoder")) == 2

@@ -7,7 +7,7 @@ from scipy.special import expit
 from scipy.stats import kstest, norm
 
 from lt_lib.envs.layout import load_layout
-from lt_lib.learnability import figures as zstudy, point_mass, predictor, sigmoid
+from lt_lib.learnability import judgements as zstudy, point_mass, predictor, sigmoid
 from lt_lib.learnability.score_function import ARMS, BASELINES, Episodes, Stack, gradient, play, train_point_mass
 from lt_lib.learnability.windows import STREAMS, WORDS, normals
 from lt_lib.report.claims import load_claims
