@@ -12,10 +12,16 @@ from lt_lib.learnability.score_function import ARMS, BASELINES, Episodes, Stack,
 from lt_lib.learnability.windows import STREAMS, WORDS, normals
 from lt_lib.report.claims import load_claims
 from lt_lib.settings.base import UserError
-from lt_lib.settings.learnability import BLOCK, PointMassConfig
+from lt_lib.settings.learnability import UPDATES_PER_LOOK, PointMassConfig
 
 SMALL = PointMassConfig(
-    window=7, distances=(0.2, 0.6), sigmas=(0.5, 1.0), seeds=2, batch=16, budgets=(BLOCK, 2 * BLOCK), evaluation=64
+    window=7,
+    distances=(0.2, 0.6),
+    sigmas=(0.5, 1.0),
+    seeds=2,
+    batch=16,
+    budgets=(UPDATES_PER_LOOK, 2 * UPDATES_PER_LOOK),
+    evaluation=64,
 )
 TASK = {"distance": 1.25, "speed": 0.5, "period": 0.1, "window": 30, "sigma": 0.601}
 CURVE = predictor.Curve(centre=4.0, width=0.3, replicates=((3.9, 0.3), (4.1, 0.3)), made_of="a test")
@@ -79,8 +85,8 @@ def literal_run(config: PointMassConfig, d: float, sigma: float, seed: int) -> n
     policy = torch.zeros(2, dtype=torch.float64, requires_grad=True)
     kind = {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[config.optimiser]
     optimiser, generators = kind([policy], lr=config.lr, maximize=True), stack.generators(config.arm, 0)
-    for _ in range(config.budgets[-1] // BLOCK):
-        for batch in Episodes.batches(arm, stack, generators, BLOCK, config.batch):
+    for _ in range(config.budgets[-1] // UPDATES_PER_LOOK):
+        for batch in Episodes.batches(arm, stack, generators, UPDATES_PER_LOOK, config.batch):
             rewards, log_probs = [], []
             for bit, side, eps in zip(batch.message[0], batch.safe[0], noise_of(batch, config), strict=True):
                 step = torch.distributions.Normal(policy[int(bit)], sigma if eps.ndim else sigma / config.window**0.5)
@@ -99,7 +105,7 @@ def literal_run(config: PointMassConfig, d: float, sigma: float, seed: int) -> n
     ("arm", "optimiser"), [("gaussian", "adam"), ("gaussian", "sgd"), ("no_signal", "adam"), ("unclamped", "adam")]
 )
 def test_a_stacked_run_equals_the_plain_loop_over_single_runs(arm, optimiser):
-    config = changed(SMALL, arm=arm, optimiser=optimiser, budgets=(BLOCK,))
+    config = changed(SMALL, arm=arm, optimiser=optimiser, budgets=(UPDATES_PER_LOOK,))
     stacked = train_point_mass(config, 3, report=quiet)
     for row in (0, 5):
         alone = literal_run(config, *(stacked[name][row].item() for name in ("d", "sigma", "seed")))
@@ -114,7 +120,7 @@ def test_a_run_is_the_same_to_the_last_bit_whatever_runs_beside_it(arm):
     row = np.flatnonzero((together["d"] == 0.6) & (together["sigma"] == 0.5) & (together["seed"] == 1)).item()
     for name, values in alone.items():
         np.testing.assert_array_equal(together[name][row], values[0])
-    shorter = train_point_mass(changed(SMALL, arm=arm, budgets=(BLOCK,)), 0, report=quiet)
+    shorter = train_point_mass(changed(SMALL, arm=arm, budgets=(UPDATES_PER_LOOK,)), 0, report=quiet)
     np.testing.assert_array_equal(shorter["success"][:, 0], together["success"][:, 0])  # a budget is a look on the way
     assert len(np.unique(together["policy"][:, -1, 0])) == len(together["d"])  # no two runs share their draws
 

@@ -18,7 +18,7 @@ from lt_lib.hardware.randomise import Appearances, draw_appearances, eight_bits,
 from lt_lib.perception.encoder import LATENT, Encoder, Frozen, in_chunks
 from lt_lib.perception.frames import Rollouts, hazard_visible, random_rollouts, wall_pixels
 from lt_lib.perception.gates import PROBE_SHARE, effective_rank
-from lt_lib.perception.jepa import GRID, LEVELS
+from lt_lib.perception.jepa import COLOUR_LEVELS, GRID
 from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 from lt_lib.settings.base import UserError
 from lt_lib.settings.hardware import HardwareGates, MatchedEncoderConfig, MatchedGateConfig
@@ -42,11 +42,11 @@ class PictureEncoder(Frozen):
 
 
 def colour_codes(colours: Float[np.ndarray, "b h w 3"]) -> Int[np.ndarray, "b g g"]:
-    """The class of each cell: the colour at its centre, quantised to LEVELS a channel."""
+    """The class of each cell: the colour at its centre, quantised to COLOUR_LEVELS a channel."""
     step = colours.shape[1] // GRID
     cells = colours[:, step // 2 :: step, step // 2 :: step]
-    quantised = np.minimum((cells * LEVELS).astype(np.int64), LEVELS - 1)
-    return quantised @ np.array([LEVELS**2, LEVELS, 1])
+    quantised = np.minimum((cells * COLOUR_LEVELS).astype(np.int64), COLOUR_LEVELS - 1)
+    return quantised @ np.array([COLOUR_LEVELS**2, COLOUR_LEVELS, 1])
 
 
 def train_matched_encoder(config: MatchedEncoderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
@@ -63,7 +63,7 @@ def train_matched_encoder(config: MatchedEncoderConfig, seed: int, *, report: Ca
     device = config.device
     with torch.random.fork_rng(devices=[]):  # module initialisation draws from torch's global generator
         torch.manual_seed(seed)
-        model = Jepa(Encoder(), class_weights(colour_codes(sample), LEVELS**3), GRID).to(device)
+        model = Jepa(Encoder(), class_weights(colour_codes(sample), COLOUR_LEVELS**3), GRID).to(device)
     frames, actions = rollouts.frames, torch.from_numpy(rollouts.actions)
 
     def losses(r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Losses:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy import stats as scipy_stats
 
 from lt_lib.learnability import sigmoid
-from lt_lib.learnability.predictor import CURVES, LEVEL, Curve, Curves
+from lt_lib.learnability.predictor import CONFIDENCE, CURVES, Curve, Curves
 from lt_lib.learnability.z_study import CEILING, CHANCE, Runs
 from lt_lib.report import stats
 from lt_lib.store.files import write_atomically
@@ -27,7 +27,7 @@ def curve_of(runs: Runs, updates: int, repeats: int, rng: np.random.Generator, m
 
 def centre_interval(curve: Curve) -> tuple[float, float]:
     """Bootstrap percentiles of the centre."""
-    low, high = np.quantile(np.array(curve.replicates)[:, 0], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    low, high = np.quantile(np.array(curve.replicates)[:, 0], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(low), float(high)
 
 
@@ -57,7 +57,7 @@ def separation(solved: Bool[np.ndarray, " r"], coverage: Float[np.ndarray, " r"]
 
 def fair_coin_best(runs: int, episodes: int) -> tuple[float, float]:
     """95% interval of the highest share of heads among `runs` fair coins, tossed `episodes` times each."""
-    tails = np.array([(1 - LEVEL) / 2, (1 + LEVEL) / 2]) ** (1 / runs)
+    tails = np.array([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]) ** (1 / runs)
     low, high = scipy_stats.binom.ppf(tails, episodes, 0.5) / episodes
     return float(low), float(high)
 

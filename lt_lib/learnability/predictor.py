@@ -29,7 +29,7 @@ from lt_lib.settings.profiles import explain
 CURVES = Path("curves") / "learnability.json"  # in the outputs of a profile
 LEARNABLE, BORDERLINE, UNLEARNABLE = "learnable", "borderline", "unlearnable"
 SURE = 0.9  # share of runs solved from which a task counts as learnable; below 1 - SURE it is unlearnable
-LEVEL = 0.95  # of the interval that has to lie beyond those shares
+CONFIDENCE = 0.95  # of the interval that has to lie beyond those shares
 FARTHEST = 10.0  # full-speed windows; a larger distance is a slip of units
 
 
@@ -53,7 +53,7 @@ class Curve(Settings):
         """Of the share solved: percentiles over the replicates."""
         centre, width = np.transpose(self.replicates)[..., None]
         shares = expit((centre - np.ravel(z)) / width)
-        low, high = np.quantile(shares, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+        low, high = np.quantile(shares, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
         return low.reshape(np.shape(z)), high.reshape(np.shape(z))
 
 

@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from lt_lib.learnability.point_mass import enters_alternative, reward
 from lt_lib.learnability.windows import STREAMS, WORDS, clamped_windows
-from lt_lib.settings.learnability import BLOCK, PointMassConfig
+from lt_lib.settings.learnability import UPDATES_PER_LOOK, PointMassConfig
 
 Generators = list[np.random.Generator]
 CHUNK = 2_048  # episodes of an evaluation that are drawn at once, to bound the memory
@@ -189,16 +189,16 @@ def train_point_mass(config: PointMassConfig, seed: int, *, report: Callable[[fl
     "d", "sigma", "seed"  (R,)
     "success"   (R, budgets) after each of `config.budgets` updates: share of fresh sampled episodes on the safe side
     "policy"    (R, budgets, 2) the parameters then
-    "coverage"  (R, updates / BLOCK) share of the training episodes of each block that entered the alternative side
+    "coverage"  (R, updates / UPDATES_PER_LOOK) share of the training episodes of each block that entered the alternative side
     """
     arm, stack, baseline = ARMS[config.arm], Stack.of(config, seed), BASELINES[config.baseline]
     policy = np.zeros((len(stack.d), 2))
     optimiser = OPTIMISERS[config.optimiser](config.lr, policy.shape)
     generators = stack.generators(config.arm, 0)
     kept, coverage = [], []
-    for done in range(BLOCK, config.budgets[-1] + 1, BLOCK):
+    for done in range(UPDATES_PER_LOOK, config.budgets[-1] + 1, UPDATES_PER_LOOK):
         shares = []
-        for episodes in Episodes.batches(arm, stack, generators, BLOCK, config.batch):
+        for episodes in Episodes.batches(arm, stack, generators, UPDATES_PER_LOOK, config.batch):
             entered, score = play(arm, stack, policy, episodes)
             rewards = reward(entered, episodes.safe)
             advantage = rewards - baseline(episodes.message, rewards)

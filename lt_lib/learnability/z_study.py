@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from lt_lib.learnability.predictor import z_score
 from lt_lib.learnability.score_function import train_point_mass
 from lt_lib.settings.base import UserError
-from lt_lib.settings.learnability import BLOCK, PointMassConfig
+from lt_lib.settings.learnability import UPDATES_PER_LOOK, PointMassConfig
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
 
@@ -32,7 +32,7 @@ class Runs(NamedTuple):
     d: Float[np.ndarray, " r"]
     sigma: Float[np.ndarray, " r"]
     success: Float[np.ndarray, "r b"]  # after each of `budgets` updates
-    coverage: Float[np.ndarray, "r blocks"]  # of every BLOCK updates
+    coverage: Float[np.ndarray, "r blocks"]  # of every UPDATES_PER_LOOK updates
     budgets: tuple[int, ...]
     seeds: int  # a setting
 
@@ -50,7 +50,7 @@ class Runs(NamedTuple):
 
     def covered(self, updates: int) -> Float[np.ndarray, " r"]:
         """Share of the training episodes of the first so many updates that entered the alternative side."""
-        return self.coverage[:, : updates // BLOCK].mean(1)
+        return self.coverage[:, : updates // UPDATES_PER_LOOK].mean(1)
 
     @property
     def largest_z(self) -> float:

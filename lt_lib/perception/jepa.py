@@ -20,13 +20,13 @@ from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
 from lt_lib.settings.perception import EncoderConfig
 from lt_lib.settings.streams import Stream
 
-LEVELS = 4  # quantised levels per colour channel
+COLOUR_LEVELS = 4  # quantised levels per colour channel
 GRID = 16  # cells per side of the reconstructed frame
 
 
 def colour_classes() -> Int[np.ndarray, " colours"]:
-    """The class of each palette entry: its colour quantised to LEVELS per channel; equal codes share a class."""
-    codes = PALETTE.astype(int) * LEVELS // 256 @ np.array([LEVELS**2, LEVELS, 1])
+    """The class of each palette entry: its colour quantised to COLOUR_LEVELS per channel; equal codes share a class."""
+    codes = PALETTE.astype(int) * COLOUR_LEVELS // 256 @ np.array([COLOUR_LEVELS**2, COLOUR_LEVELS, 1])
     return np.unique(codes, return_inverse=True)[1]
 
 

@@ -10,7 +10,7 @@ from lt_lib.settings.base import ROOT
 
 README = ROOT / "README.md"
 FULL = ROOT / "outputs" / "full"
-BLOCK = re.compile(r"(<!-- headline: begin.*?-->\n).*?(<!-- headline: end -->)", re.DOTALL)
+HEADLINE = re.compile(r"(<!-- headline: begin.*?-->\n).*?(<!-- headline: end -->)", re.DOTALL)
 
 
 def refreshed(text: str, outputs: Path = FULL) -> str:
@@ -19,7 +19,7 @@ def refreshed(text: str, outputs: Path = FULL) -> str:
     board = join(claims, read_findings(outputs, claims, "full"), "full")
     table = f"Route optimality by message content (Table III), mean over seeds [95% interval]:\n\n{headline(board)}\n\n"
     sums = f"All claims: {summary(board)}. {computed_by(outputs)}\n"
-    return BLOCK.sub(lambda found: f"{found[1]}{table}{sums}{found[2]}", text)
+    return HEADLINE.sub(lambda found: f"{found[1]}{table}{sums}{found[2]}", text)
 
 
 def computed_by(outputs: Path) -> str:

@@ -6,10 +6,10 @@ from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from lt_lib.settings.base import Settings
 
-BLOCK = 25  # updates of the point-mass study between two looks at it
+UPDATES_PER_LOOK = 25  # updates of the point-mass study between two looks at it
 
 
-Budget = Annotated[int, Field(gt=0, multiple_of=BLOCK)]
+Budget = Annotated[int, Field(gt=0, multiple_of=UPDATES_PER_LOOK)]
 
 
 class PointMassConfig(Settings):
