@@ -189,7 +189,7 @@ def train_point_mass(config: PointMassConfig, seed: int, *, report: Callable[[fl
     "d", "sigma", "seed"  (R,)
     "success"   (R, budgets) after each of `config.budgets` updates: share of fresh sampled episodes on the safe side
     "policy"    (R, budgets, 2) the parameters then
-    "coverage"  (R, updates / UPDATES_PER_LOOK) share of the training episodes of each block that entered the alternative side
+    "coverage"  (R, looks) share of the training episodes that entered the alternative side, since the look before
     """
     arm, stack, baseline = ARMS[config.arm], Stack.of(config, seed), BASELINES[config.baseline]
     policy = np.zeros((len(stack.d), 2))
