@@ -219,7 +219,7 @@ def test_curves_are_read_from_what_the_study_kept(tmp_path):
     other = CURVE.model_copy(update={"centre": 5.0})
     zstudy.keep_curves({"100 updates": CURVE, "200 updates": other}, "200 updates", tmp_path)
     assert predictor.load_curve(path=path) == other and predictor.load_curve("100 updates", path) == CURVE
-    with pytest.raises(UserError, match="no curve '7 updates'; there are 100 updates, 200 updates"):
+    with pytest.raises(UserError, match="no curve '7 updates'; known: 100 updates, 200 updates"):
         predictor.load_curve("7 updates", path)
     path.write_text(path.read_text().replace('"width":0.3', '"width":-0.3'))
     with pytest.raises(UserError, match="width: must be greater than 0"):

@@ -32,7 +32,7 @@ def centre_interval(curve: Curve) -> tuple[float, float]:
 
 
 def keep_curves(curves: Mapping[str, Curve], main: str, outputs: Path) -> None:
-    """Writes the curves where the predictor looks for them, with the name of the one it answers from."""
+    """Writes the curves, and the name of the default one, where the predictor reads them."""
     write_atomically(outputs / CURVES, (Curves(main=main, curves=dict(curves)).model_dump_json() + "\n").encode())
 
 
@@ -42,13 +42,13 @@ def at_chance(success: Float[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
 
 
 def outcomes(success: Float[np.ndarray, " r"]) -> dict[str, int]:
-    """How many runs end at ceiling, at chance, and anywhere else."""
+    """Number of runs that end at ceiling, at chance and elsewhere."""
     ceiling, chance = success >= CEILING, at_chance(success)
     return {"ceiling": int(ceiling.sum()), "chance": int(chance.sum()), "between": int((~ceiling & ~chance).sum())}
 
 
 def separation(solved: Bool[np.ndarray, " r"], coverage: Float[np.ndarray, " r"]) -> float:
-    """AUC: the probability that a solved run has the greater coverage of a pair, ties counting half."""
+    """AUC: the probability that a solved run covers more than an unsolved one, ties counting half."""
     with_, without = coverage[solved], coverage[~solved]
     if not len(with_) or not len(without):
         return 0.5
@@ -63,7 +63,7 @@ def fair_coin_best(runs: int, episodes: int) -> tuple[float, float]:
 
 
 def majority_edge(runs: Runs, updates: int) -> float:
-    """The largest z at which most seeds of a setting are solved; 0 if there is none."""
+    """The largest z at which most seeds of a setting are solved; 0 if none."""
     solved = runs.solved(updates) > runs.seeds / 2
     return float(runs.per_setting(runs.z)[solved].max(initial=0.0))
 
@@ -75,12 +75,12 @@ def compare(runs: Runs, updates: int) -> sigmoid.Comparison:
 
 
 def hit_edge(windows: float) -> float:
-    """The z at which one of so many windows of a policy that does not move arrives with even odds."""
+    """The z at which a fixed policy has even odds of arriving at least once in this many windows."""
     return float(scipy_stats.norm.isf(-np.expm1(np.log(0.5) / windows)))
 
 
 def mean_by_setting(runs: Runs, values: Float[np.ndarray, " r"]) -> tuple[float, float, float]:
-    """Mean over runs and its 95% Student interval, with the settings as units."""
+    """Mean over runs and its 95% Student-t interval; the setting is the unit."""
     means = values.reshape(-1, runs.seeds).mean(1)
     return float(means.mean()), *stats.mean_interval(means)
 
@@ -100,7 +100,7 @@ def judge_collapse(comparison: sigmoid.Comparison, explained: float) -> dict[str
 
 
 def judge_control(success: Float[np.ndarray, " r"], episodes: int) -> dict[str, Any]:
-    """The highest success of runs with an empty message, as a finding, against as many fair coins."""
+    """The highest success among runs with an empty message, as a finding, against as many fair coins."""
     low, high = fair_coin_best(len(success), episodes)
     best = float(success.max())
     own = stats.wilson(round(best * episodes), episodes)

@@ -1,8 +1,8 @@
-"""The point-mass task (Section 'A scalar predictor of learnability'): nothing in common with our scene but its logic.
+"""The point-mass task (Section 'A scalar predictor of learnability'), which shares only its logic with our scene.
 
-A point mass runs along a corridor at constant speed while it is commanded sideways. After N control steps it is on the
-alternative side if the mean of its N lateral commands was at least d, and on the incumbent side otherwise. One of the
-two sides is safe. Lengths are in full-command steps, so that a mean command of d means d * N sideways.
+A point mass moves along a corridor at constant speed under lateral commands. After N control steps it is on the
+alternative side if the mean of its N commands was at least d, otherwise on the incumbent side. One of the two sides is
+safe. Lengths are in full-command steps, so a mean command of d moves it d * N sideways.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ def reward(entered: Bool[np.ndarray, "*e"], safe: Bool[np.ndarray, "*e"]) -> Flo
 
 
 def positions(commands: Float[np.ndarray, "*e n"]) -> Float[np.ndarray, "*e n+1 2"]:
-    """The way through the corridor: (steps along it, steps sideways), from the start on."""
+    """The path through the corridor, including the start: (steps along, steps sideways)."""
     sideways = np.concatenate([np.zeros_like(commands[..., :1]), commands.cumsum(-1)], axis=-1)
     along = np.broadcast_to(np.arange(sideways.shape[-1], dtype=sideways.dtype), sideways.shape)
     return np.stack([along, sideways], axis=-1)

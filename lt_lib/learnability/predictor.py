@@ -1,12 +1,12 @@
 """Will exploration ever sample the decision? The scalar predictor z (Section 'A scalar predictor of learnability').
 
-Ask about a task of your own in three lines; lengths in metres, times in seconds, sigma in units of full command:
+Ask about your own task in three lines; lengths in metres, times in seconds, sigma in units of full command:
 
     from lt_lib.learnability.predictor import ask
     answer = ask(distance=1.25, speed=0.5, period=0.1, window=30, sigma=0.601)
     print(answer)
 
-The verdict comes from a curve that the point-mass study (notebook 06) fitted and kept; it is read, never typed.
+The verdict comes from the curve that the point-mass study (notebook 06) fitted and saved; no number is typed in.
 """
 
 import json
@@ -26,15 +26,15 @@ from lt_lib.envs.layout import Layout
 from lt_lib.settings.base import ROOT, Settings, UserError
 from lt_lib.settings.profiles import explain
 
-CURVES = Path("curves") / "learnability.json"  # in the outputs of a profile
+CURVES = Path("curves") / "learnability.json"  # in a profile's outputs
 LEARNABLE, BORDERLINE, UNLEARNABLE = "learnable", "borderline", "unlearnable"
-SURE = 0.9  # share of runs solved from which a task counts as learnable; below 1 - SURE it is unlearnable
-CONFIDENCE = 0.95  # of the interval that has to lie beyond those shares
-FARTHEST = 10.0  # full-speed windows; a larger distance is a slip of units
+SURE = 0.9  # a task is learnable if at least this share of runs solves it, unlearnable below 1 - SURE
+CONFIDENCE = 0.95  # of the interval that must lie beyond these shares
+FARTHEST = 10.0  # full-speed windows; a larger distance is a unit error
 
 
 def z_score(d: Any, window: Any, sigma: Any) -> Any:
-    """Standard deviations from a zero-mean policy's window mean to d, Eq. z; broadcasts."""
+    """Distance from a zero-mean policy's window mean to d in standard deviations, Eq. z; broadcasts."""
     return d * np.sqrt(window) / sigma
 
 
@@ -50,7 +50,7 @@ class Curve(Settings):
         return expit((self.centre - np.asarray(z)) / self.width)
 
     def interval(self, z: Any) -> tuple[Any, Any]:
-        """Of the share solved: percentiles over the replicates."""
+        """Percentile interval of the share solved, over the replicates."""
         centre, width = np.transpose(self.replicates)[..., None]
         shares = expit((centre - np.ravel(z)) / width)
         low, high = np.quantile(shares, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
@@ -58,28 +58,28 @@ class Curve(Settings):
 
 
 class Curves(Settings):
-    """The curves that the study left, by name, and the name of the one that answers unless another is asked for."""
+    """The study's curves by name, and the name of the default one."""
 
     main: str
     curves: dict[str, Curve]
 
 
 def load_curve(name: str = "", path: Path = ROOT / "outputs" / "full" / CURVES) -> Curve:
-    """A curve that the point-mass study left in the outputs of a profile, such as '100 updates'; '' is its main one.
+    """A curve of the point-mass study from a profile's outputs, such as '100 updates'; '' is the main one.
 
-    Raises UserError, one line, where there is none or it cannot be read.
+    Raises a one-line UserError if it is missing or unreadable.
     """
     try:
         kept = Curves.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         where = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
-        raise UserError(f"no curve at {where}; `python run_all.py --only z_study` makes it") from None
+        raise UserError(f"no curve at {where}; create it with `python run_all.py --only z_study`") from None
     except ValidationError as error:
         raise UserError(explain(error, path.name, Curves)) from None
     except (OSError, ValueError) as error:
         raise UserError(f"{path.name}: cannot be read: {error}") from None
     if (name or kept.main) not in kept.curves:
-        raise UserError(f"{path.name}: no curve {name or kept.main!r}; there are {', '.join(kept.curves)}")
+        raise UserError(f"{path.name}: no curve {name or kept.main!r}; known: {', '.join(kept.curves)}")
     return kept.curves[name or kept.main]
 
 
@@ -87,16 +87,16 @@ def load_curve(name: str = "", path: Path = ROOT / "outputs" / "full" / CURVES) 
 class Task:
     """A lateral decision under velocity commands.
 
-    distance  metres sideways to the alternative
+    distance  lateral metres to the alternative
     speed     m/s at full lateral command
-    period    seconds of a control step
-    window    control steps within which the decision falls
+    period    seconds per control step
+    window    control steps within which the decision is made
     sigma     standard deviation of one step's command, in units of full command
 
-    Raises UserError, one line, for a value that cannot be, or that betrays another unit.
+    Raises a one-line UserError for an impossible value or one that suggests the wrong unit.
     """
 
-    distance: Any  # typed as anything, so that what is no number is refused in our words
+    distance: Any  # untyped, so that our own message rejects a non-number
     speed: Any
     period: Any
     window: Any
@@ -128,7 +128,7 @@ class Task:
 
     @property
     def step(self) -> float:
-        """Metres of one step of full lateral command."""
+        """Metres per step at full lateral command."""
         return self.speed * self.period
 
     @property
@@ -142,13 +142,13 @@ class Task:
 
     @property
     def probability(self) -> float:
-        """That the mean of a window of iid Gaussian commands about zero reaches d; an upper bound, see the paper."""
+        """Probability that a window of zero-mean iid Gaussian commands averages d or more; upper bound, see paper."""
         return float(norm.sf(self.z))
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the predictor says of a task, and the curve that it says it from."""
+    """The predictor's answer for a task, and the curve behind it."""
 
     task: Task
     curve: Curve
@@ -173,9 +173,9 @@ class Answer:
 
     @property
     def verdict(self) -> str:
-        """Learnable or unlearnable where the whole interval lies beyond SURE or 1 - SURE, borderline between.
+        """Learnable or unlearnable if the whole interval lies beyond SURE or 1 - SURE, otherwise borderline.
 
-        With d above 1 not even full command in every step arrives in time.
+        With d above 1, even full command in every step falls short.
         """
         low, high = self.interval
         if self.task.d > 1 or high <= 1 - SURE:
@@ -192,12 +192,12 @@ class Answer:
 
 
 def ask(distance: Any, speed: Any, period: Any, window: Any, sigma: Any, curve: Curve | None = None) -> Answer:
-    """What the predictor says of a task (arguments as in Task), from the full study's main curve if none is given."""
+    """The predictor's answer for a task (arguments as in Task); the default curve is the full study's main one."""
     return Answer(Task(distance, speed, period, window, sigma), curve or load_curve())
 
 
 def scene_task(layout: Layout, sigma: float) -> Task:
-    """The decision in our own scene: from the spawn to the middle of the farther mouth, on the way to the barrier."""
+    """The decision in our own scene: from the spawn to the centre of the farther mouth, on the way to the barrier."""
     mouths = [corridor.legs[0] for corridor in layout.routes]
     distance = max(abs(sum(mouth.y) / 2 - layout.spawn.y) for mouth in mouths)
     approach = min(mouth.x[0] for mouth in mouths) - layout.spawn.x

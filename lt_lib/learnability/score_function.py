@@ -1,9 +1,9 @@
 """The score-function gradient on the point-mass task (Section 'A scalar predictor of learnability').
 
-Many runs advance side by side as the rows of one array. Every row draws from generators of its own, which are keyed by
-what the run is and not by where it stands, so that a run's result is the same to the last bit whatever runs beside it.
+Many runs advance side by side as rows of one array. Each row has its own generators, keyed by the run's parameters and
+not by its row, so a run's result is bit-identical whatever runs beside it.
 
-A policy is two numbers, one for each message: the mean lateral command, or the logit of the alternative side.
+A policy is two numbers, one per message: the mean lateral command, or the logit of the alternative side.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from lt_lib.learnability.windows import STREAMS, WORDS, clamped_windows
 from lt_lib.settings.learnability import UPDATES_PER_LOOK, PointMassConfig
 
 Generators = list[np.random.Generator]
-CHUNK = 2_048  # episodes of an evaluation that are drawn at once, to bound the memory
+CHUNK = 2_048  # evaluation episodes drawn at once, to bound memory
 
 
 class Stack(NamedTuple):
@@ -31,14 +31,14 @@ class Stack(NamedTuple):
 
     @classmethod
     def of(cls, config: PointMassConfig, seed: int) -> "Stack":
-        """Every d with every sigma, `config.seeds` seeds each, the first of them `seed`."""
+        """Every d with every sigma, `config.seeds` seeds each, starting at `seed`."""
         seeds = np.arange(seed, seed + config.seeds)
         grid = np.meshgrid(config.distances, config.sigmas, seeds, indexing="ij")
         d, sigma, seeds = (values.reshape(-1, 1) for values in grid)
         return cls(config.window, d, sigma, seeds.astype(int))
 
     def generators(self, arm: str, use: int) -> Generators:
-        """One generator a run, for training (0) or for the evaluation after `use` updates."""
+        """One generator per run, for training (0) or for the evaluation after `use` updates."""
         names = sorted(ARMS)
         return [
             np.random.default_rng([seed, names.index(arm), self.window, round(d * 1e6), round(sigma * 1e6), use])
@@ -47,9 +47,9 @@ class Stack(NamedTuple):
 
 
 class Arm(NamedTuple):
-    """How a policy explores, and whether its message tells anything.
+    """How a policy explores, and whether its message is informative.
 
-    chance  (generator, (batches, episodes), stack) -> what chance decides about one run's batches, (batches, ...)
+    chance  (generator, (batches, episodes), stack) -> the random part of one run's batches, (batches, ...)
     act     (chosen parameter (R, B), a batch's chance (R, ...), stack) -> window's mean command and score, (R, B) each
     signal  whether the message says which side is safe; if not, the side is drawn independently of it
     """
@@ -64,9 +64,9 @@ def _window_seeds(rng: np.random.Generator, batches: tuple[int, int], stack: Sta
 
 
 def _act_by_steps(mean: Float[np.ndarray, "r b"], seeds: UInt32[np.ndarray, "r w s"], stack: Stack):
-    """Every one of the N commands, clamped to full command at the actuator; the score is the unclamped policy's.
+    """Draws all N commands, clamped to full command at the actuator; the score is the unclamped policy's.
 
-    The score of the window is sum_t (a_t - mu) / sigma^2, the a_t as drawn.
+    The score of the window is sum_t (a_t - mu) / sigma^2, with a_t as drawn.
     """
     means, noise = clamped_windows(seeds, mean, stack.sigma, stack.window)
     return means, noise / stack.sigma
@@ -77,7 +77,7 @@ def _mean_noise(rng: np.random.Generator, batches: tuple[int, int], stack: Stack
 
 
 def _act_by_mean(mean: Float[np.ndarray, "r b"], noise: Float[np.ndarray, "r b"], stack: Stack):
-    """N unclamped commands through their mean, which is Gaussian and decides both the outcome and the score.
+    """Draws the Gaussian mean of N unclamped commands, which decides both the outcome and the score.
 
     The score of the window is N (mean_t a_t - mu) / sigma^2.
     """
@@ -90,7 +90,7 @@ def _uniform(rng: np.random.Generator, batches: tuple[int, int], stack: Stack) -
 
 
 def _act_by_draw(logit: Float[np.ndarray, "r b"], noise: Float[np.ndarray, "r b"], stack: Stack):
-    """One draw of the side an episode, then driven there: twice the command that it needs, or none at all."""
+    """Draws the side once per episode and drives there: twice the command that the alternative needs, or none."""
     probability = expit(logit)
     alternative = noise < probability
     return 2 * stack.d * alternative, alternative - probability
@@ -105,7 +105,7 @@ ARMS = {
 
 
 class Episodes(NamedTuple):
-    """What chance decides about a batch of B episodes of R runs."""
+    """The random part of a batch of B episodes of R runs."""
 
     message: Bool[np.ndarray, "r b"]
     safe: Bool[np.ndarray, "r b"]  # whether the alternative side is the safe one
@@ -113,7 +113,7 @@ class Episodes(NamedTuple):
 
     @classmethod
     def batches(cls, arm: Arm, stack: Stack, generators: Generators, count: int, size: int) -> "list[Episodes]":
-        """So many batches, each run's all in one draw of its own."""
+        """`count` batches of `size` episodes; each run draws all of its batches at once."""
         drawn = []
         for rng in generators:
             message = rng.random((count, size)) < 0.5
@@ -124,7 +124,7 @@ class Episodes(NamedTuple):
 
 
 def play(arm: Arm, stack: Stack, policy: Float[np.ndarray, "r 2"], episodes: Episodes):
-    """Episodes under a policy: whether each entered the alternative side, and its score, (R, B) both."""
+    """Plays episodes under a policy: whether each entered the alternative side, and its score, (R, B) each."""
     chosen = np.where(episodes.message, policy[:, 1:], policy[:, :1])
     command, score = arm.act(chosen, episodes.chance, stack)
     return enters_alternative(command, stack.d), score
@@ -135,7 +135,7 @@ def _over_batch(message: Bool[np.ndarray, "r b"], rewards: Float[np.ndarray, "r 
 
 
 def _over_message(message: Bool[np.ndarray, "r b"], rewards: Float[np.ndarray, "r b"]) -> Float[np.ndarray, "r b"]:
-    """The mean over the episodes with the same message: zero advantage where they all ended alike."""
+    """The mean over the episodes with the same message; the advantage is zero if they all ended alike."""
     means = []
     for which in (~message, message):
         total = np.where(which, rewards, 0.0).sum(1, keepdims=True)
@@ -149,14 +149,14 @@ BASELINES = {"batch": _over_batch, "message": _over_message}
 def gradient(
     message: Bool[np.ndarray, "r b"], score: Float[np.ndarray, "r b"], advantage: Float[np.ndarray, "r b"]
 ) -> Float[np.ndarray, "r 2"]:
-    """Score-function estimate of the gradient of the expected reward by the parameter of either message."""
+    """Score-function estimate of the gradient of the expected reward with respect to each message's parameter."""
     weighted = advantage * score
     told = weighted * message
     return np.stack([(weighted - told).mean(1), told.mean(1)], axis=1)
 
 
 class Adam:
-    """Adam with the usual decays; `step` gives what to add to the policy."""
+    """Adam with the usual decays; `step` returns the policy's increment."""
 
     def __init__(self, lr: float, shape: tuple[int, ...]):
         self._lr, self._count = lr, 0
@@ -188,8 +188,8 @@ def train_point_mass(config: PointMassConfig, seed: int, *, report: Callable[[fl
 
     "d", "sigma", "seed"  (R,)
     "success"   (R, budgets) after each of `config.budgets` updates: share of fresh sampled episodes on the safe side
-    "policy"    (R, budgets, 2) the parameters then
-    "coverage"  (R, looks) share of the training episodes that entered the alternative side, since the look before
+    "policy"    (R, budgets, 2) the parameters at that point
+    "coverage"  (R, looks) share of the training episodes since the previous look that entered the alternative side
     """
     arm, stack, baseline = ARMS[config.arm], Stack.of(config, seed), BASELINES[config.baseline]
     policy = np.zeros((len(stack.d), 2))

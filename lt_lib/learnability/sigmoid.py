@@ -1,7 +1,7 @@
-"""Fits of the share of solved runs against z: one sigmoid, one for each window length, and their comparison.
+"""Fits of the share of solved runs against z: one sigmoid, one per window length, and their comparison.
 
-A setting is the unit: its seeds share d, N and sigma, so resampling takes settings whole and the comparison of
-models lets the counts of a setting scatter more than a binomial's.
+The setting is the unit: its seeds share d, N and sigma, so the bootstrap resamples whole settings and the model
+comparison allows the counts of a setting more scatter than a binomial.
 
 z (S,) of the settings, solved (S,) counts out of n seeds each, group (S,) index of the window length.
 """
@@ -15,19 +15,19 @@ from scipy import stats
 from scipy.optimize import minimize
 from scipy.special import expit, log_expit
 
-WIDTHS = (0.02, 20.0)  # of the sigmoid; without a lower bound it has no fit where one z separates the outcomes
-ALIKE = (1e-6, 0.99)  # correlation of the seeds of one setting
+WIDTHS = (0.02, 20.0)  # of the sigmoid; without a lower bound no fit exists if one z separates the outcomes
+ALIKE = (1e-6, 0.99)  # correlation between seeds of one setting
 Z, Counts = Float[np.ndarray, " s"], Int[np.ndarray, " s"]
 
 
 def fit(z: Z, solved: Counts, n: int) -> tuple[float, float]:
-    """Centre and width of the likeliest sigmoid, seeds binomial."""
+    """Maximum-likelihood centre and width of the sigmoid, seeds binomial."""
     centre, log_width = _likeliest(partial(_binomial, z, np.zeros(len(z), int), solved, n), z, 1).x
     return float(centre), float(np.exp(log_width))
 
 
 def bootstrap(z: Z, solved: Counts, n: int, repeats: int, rng: np.random.Generator) -> Float[np.ndarray, "b 2"]:
-    """Centre and width over resampled settings, each the likeliest on a grid of sigmoids (centres 0.05 apart)."""
+    """Centre and width over resampled settings, each by maximum likelihood on a grid (centres 0.05 apart)."""
     centres, widths = np.arange(z.min(), z.max() + 0.05, 0.05), np.geomspace(*WIDTHS, 50)
     grid = np.stack(np.meshgrid(centres, widths, indexing="ij"), -1).reshape(-1, 2)
     logit = (grid[:, :1] - z) / grid[:, 1:]
@@ -43,17 +43,17 @@ def explained(z: Z, solved: Counts, n: int, centre: float, width: float) -> floa
 
 
 class Comparison(NamedTuple):
-    """One sigmoid for all against one centre for each window length (a common width)."""
+    """One sigmoid for all against one centre per window length (common width)."""
 
     centres: Float[np.ndarray, " g"]
-    statistic: float  # twice the difference of log-likelihoods, seeds of a setting alike (beta-binomial)
+    statistic: float  # twice the difference of log-likelihoods, seeds of a setting correlated (beta-binomial)
     p: float
-    naive_p: float  # the same with all seeds taken as independent (binomial)
-    alike: float  # correlation of the seeds of a setting under one curve
+    naive_p: float  # the same with all seeds independent (binomial)
+    alike: float  # correlation between seeds of a setting under one curve
 
 
 def compare(z: Z, group: Int[np.ndarray, " s"], solved: Counts, n: int) -> Comparison:
-    """Likelihood-ratio test that the window length adds nothing to a logistic model that has z."""
+    """Likelihood-ratio test of whether the window length adds anything to a logistic model in z."""
     groups, together = int(group.max()) + 1, np.zeros(len(z), int)
     naive = [_likeliest(partial(_binomial, z, g, solved, n), z, int(g.max()) + 1) for g in (together, group)]
     clustered = [
@@ -66,7 +66,7 @@ def compare(z: Z, group: Int[np.ndarray, " s"], solved: Counts, n: int) -> Compa
 
 
 def _likeliest(loss, z: Z, groups: int, start=None):
-    """The minimum of a negative log-likelihood over centres, log width and, given a start without it, correlation."""
+    """Minimises a negative log-likelihood over centres, log width and, given a start without it, correlation."""
     bounds = [(z.min(), z.max())] * groups + [tuple(np.log(WIDTHS))]
     if start is None:
         starts = [np.array([centre] * groups + [0.0]) for centre in np.quantile(z, (0.2, 0.4, 0.6))]

@@ -1,10 +1,10 @@
 """Windows of clamped Gaussian commands, drawn and cut in one compiled call (Section 'A scalar predictor').
 
-The normals come from interleaved streams of xoshiro128+ (Blackman and Vigna) through the transform of Box and Muller
-with Cephes' single-precision logarithm: plain loops over arrays, which a processor's vector unit runs many elements at
-a time. The normals are never kept; what leaves is each window's mean command and the sum of its noise.
+The normals come from interleaved streams of xoshiro128+ (Blackman and Vigna) by the Box-Muller transform, with Cephes'
+single-precision logarithm: plain array loops that the CPU vectorises. They are never stored; only each window's mean
+command and the sum of its noise are returned.
 
-Kept apart from the annotated functions that call it, since compiled code must not be wrapped by run-time shape checks.
+This is a module of its own because run-time shape checks must not wrap compiled code.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from numpy import float32, int32, uint32
 
 from lt_lib.envs.compiled import compiled
 
-WORDS, STREAMS = 4, 16  # the state of chance: so many words of 32 bits for each stream
+WORDS, STREAMS = 4, 16  # generator state: 32-bit words per stream, and streams
 FULL = float32(1.0)  # full command
-PIECE = 320  # pairs of normals that are made at once, few enough for a processor's first cache
+PIECE = 320  # pairs of normals per block, which fits the L1 cache
 _ROOT_HALF = int32(0x3F3504F3)  # the bits of sqrt(1/2) as a float
 _FRACTION = int32(0x007FFFFF)
 
@@ -64,7 +64,7 @@ def _log(mantissa, exponent):
 
 @compiled(inline="always")
 def _sine(turn):
-    """Of an angle within a quarter turn of zero; Taylor's polynomial of degree 11, 6e-8 off at most."""
+    """Sine of an angle within a quarter turn of zero: Taylor polynomial of degree 11, error at most 6e-8."""
     x = float32(2 * np.pi) * turn
     z = x * x
     y = float32(-1 / 39916800)
@@ -77,7 +77,7 @@ def _sine(turn):
 
 @compiled(fastmath=True)
 def _box_muller(mantissa, exponent, drawn, first, second):
-    """Two normals from a radius and an angle in the right half of the circle; a random sign makes it the whole."""
+    """Two normals from a radius and an angle in the right half of the circle; a random sign adds the left half."""
     for i in range(drawn.size):
         radius = np.sqrt(float32(-2) * _log(mantissa[i], exponent[i]))
         turn = float32(int32(drawn[i] >> uint32(8))) * float32(2**-25) - float32(0.25)
@@ -115,9 +115,9 @@ def _clamp(noise, mean, sigma, steps, means, sums):
 
 @compiled()
 def clamped_windows(seeds, mean, sigma, steps):
-    """Windows of so many iid commands: their means after the clamp, and the sums of their noise before it.
+    """Windows of `steps` iid commands: their means after the clamp and the sums of their noise before it.
 
-    seeds (R, WORDS, STREAMS) random bits; mean (R, B) of a command; sigma (R, 1) of one. Returns two (R, B).
+    seeds (R, WORDS, STREAMS) random bits; mean (R, B) and sigma (R, 1) of a command. Returns two (R, B).
     """
     runs, episodes = mean.shape
     means, sums = np.empty((runs, episodes)), np.empty((runs, episodes))

@@ -1,4 +1,4 @@
-"""The point-mass study: which stacks of runs it is made of, and their results as one table of runs.
+"""The point-mass study: its stacks of runs, and their results as one table of runs.
 
 The unit of training is a stack: all runs of one arm that share a window length.
 """
@@ -20,36 +20,36 @@ from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
 
 SEED = 0  # of the first run of every setting
-CEILING = 0.95  # final success from which a run counts as solved
-CONTROL = 4  # times as many episodes measure the control, of which the paper prints the highest to three digits
+CEILING = 0.95  # least final success of a solved run
+CONTROL = 4  # times as many episodes for the control, whose highest success the paper prints to three digits
 CHANCE = (0.45, 0.55)  # final success of a run at chance
 
 
 class Runs(NamedTuple):
-    """R runs of one arm; the seeds of a setting stand beside each other."""
+    """R runs of one arm; the seeds of a setting are adjacent."""
 
     window: Int[np.ndarray, " r"]
     d: Float[np.ndarray, " r"]
     sigma: Float[np.ndarray, " r"]
     success: Float[np.ndarray, "r b"]  # after each of `budgets` updates
-    coverage: Float[np.ndarray, "r blocks"]  # of every UPDATES_PER_LOOK updates
+    coverage: Float[np.ndarray, "r blocks"]  # over each UPDATES_PER_LOOK updates
     budgets: tuple[int, ...]
-    seeds: int  # a setting
+    seeds: int  # per setting
 
     @property
     def z(self) -> Float[np.ndarray, " r"]:
         return z_score(self.d, self.window, self.sigma)
 
     def at(self, updates: int) -> Float[np.ndarray, " r"]:
-        """Success of every run after so many updates, one of the budgets."""
+        """Success of every run after `updates` updates, one of the budgets."""
         return self.success[:, self.budgets.index(updates)]
 
     def solved(self, updates: int) -> Int[np.ndarray, " s"]:
-        """How many seeds of every setting are at ceiling."""
+        """Number of seeds at ceiling per setting."""
         return (self.at(updates) >= CEILING).reshape(-1, self.seeds).sum(1)
 
     def covered(self, updates: int) -> Float[np.ndarray, " r"]:
-        """Share of the training episodes of the first so many updates that entered the alternative side."""
+        """Share of the training episodes in the first `updates` updates that entered the alternative side."""
         return self.coverage[:, : updates // UPDATES_PER_LOOK].mean(1)
 
     @property
@@ -67,10 +67,10 @@ class ZStudy:
 
     config   what all stacks share
     windows  lengths N, control steps
-    looks    budgets at which the Gaussian runs are looked at; they increase and contain config.budgets[-1], which the
-             study is judged at. Without a schedule, a run that goes on is at each budget the run that ended there
+    looks    increasing budgets at which the Gaussian runs are measured; they contain config.budgets[-1], at which the
+             study is judged. Without a schedule, a longer run is identical at each budget to the run that ends there
 
-    Raises UserError where they do not.
+    Raises UserError for looks that do not increase or lack that budget.
     """
 
     store: RunStore
@@ -87,11 +87,11 @@ class ZStudy:
         return self.config.budgets[-1]
 
     def parts(self, rates: Sequence[float]) -> dict[str, PointMassConfig]:
-        """What the study is made of, by what is particular to it; each part is trained at every window length.
+        """The study's parts by name; each is trained at every window length.
 
         gaussian, categorical, no_signal  the three arms
-        unclamped   Gaussian runs whose commands may be of any size
-        no_drift    those, with a baseline for each message: no gradient while a message's episodes all end alike
+        unclamped   Gaussian runs with unbounded commands
+        no_drift    the same, with one baseline per message: no gradient while a message's episodes all end alike
         sgd <rate>  Gaussian runs under plain gradient ascent
         """
         particular = {
@@ -105,16 +105,16 @@ class ZStudy:
         return {name: self.config.model_copy(update=changes) for name, changes in particular.items()}
 
     def all_runs(self, rates: Sequence[float]) -> dict[str, Runs]:
-        """Every run of the study, by the names of its parts."""
+        """Every run of the study, by part."""
         parts = self.parts(rates)
         results = self.store.fetch([Run(train_point_mass, s, SEED) for s in self._stacks(parts)], "point-mass runs")
         each = _batched(results, len(self.windows))
         return {name: self._joined(part, own) for (name, part), own in zip(parts.items(), each, strict=True)}
 
     def stacking_gain(self, rates: Sequence[float], singles: int, updates: int) -> tuple[float, float]:
-        """Processor seconds of the whole study, stacked and one run after another.
+        """CPU seconds of the whole study, stacked and one run after another.
 
-        Every stack is timed over its first `updates` updates, in turns with `singles` of its runs alone.
+        Each stack is timed over its first `updates` updates, alternating with `singles` of its runs alone.
         """
         stacked, alone = 0.0, 0.0
         for stack in self._stacks(self.parts(rates)):
