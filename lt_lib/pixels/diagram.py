@@ -1,4 +1,4 @@
-"""Fig. 2, the pipeline, drawn by code from the settings that are used."""
+"""Fig. 2, the pipeline, drawn from the settings in use."""
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,7 +12,7 @@ FROZEN, TRAINED, GRADIENT = "#DCE9F5", "#FDE9C9", "#B22222"
 
 
 def pipeline(layout: Layout) -> Figure:
-    """Stage 1 (no labels, no reward) and stage 2 (the reward reaches the route head alone)."""
+    """Stage 1 (no labels, no reward) and stage 2 (the reward reaches only the route head)."""
     figure = Figure(figsize=(12.5, 4.4), layout="constrained")
     axes = figure.subplots()
     axes.set(xlim=(0, 12.5), ylim=(0, 4.4))

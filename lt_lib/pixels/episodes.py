@@ -1,7 +1,7 @@
 """Episodes of the frozen executor, and the bank of them that all message conditions share.
 
-The executor cannot read the message. How an episode goes, given the draw of the scene, the blocked corridor and the
-commanded route, is therefore the same for every content, and is simulated once.
+The executor cannot read the message. Given the draw of the scene, the blocked corridor and the commanded route, an
+episode is therefore the same for every content, and is simulated once.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ from lt_lib.settings.streams import Stream
 
 SLABS = 2
 ARRIVAL_REWARD = 1.0
-CONTACT_REWARD = -0.01  # a control step in contact with the slab
+CONTACT_REWARD = -0.01  # per control step in contact with the slab
 
 
 class Outcomes(NamedTuple):
@@ -38,7 +38,7 @@ class Outcomes(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """What chance decides about a scene besides the slab: spawn and scout poses, (E, 3) metres, metres, radians."""
+    """The random part of a scene besides the slab: spawn and scout poses, (E, 3) metres, metres, radians."""
 
     spawn: Float[np.ndarray, "e 3"]
     scout: Float[np.ndarray, "e 3"]
@@ -62,13 +62,13 @@ def drive(
     """Drives E episodes, `envs` at a time, each from its draw to the goal or the time-out.
 
     slab, route  (E,) 0 left, 1 right: the blocked corridor and the commanded one
-    commit_step  the navigator waits until then, since no message can have told it where to go
+    commit_step  the navigator waits until this step, since no message can have told it where to go
 
     A batch always has `envs` rows, so that an episode's arithmetic does not depend on what runs beside it.
     """
     arena, camera = Arena(layout, envs), FastCamera(layout)
     seats, outcome = Seats(envs, len(slab)), none_yet(len(slab))
-    episode = seats.episode  # rows to spare replay one and are not recorded
+    episode = seats.episode  # spare rows replay an episode and are not recorded
     arena.reset(np.ones(envs, bool), draws.spawn[episode], slab[episode], draws.scout[episode])
     while seats.live.any():
         latent = encoder.latent(camera.frames(arena.pose, arena.slab, arena.scout[:, :2]))
@@ -85,7 +85,7 @@ def drive(
 
 
 class Seats:
-    """Which episode each row plays: a row whose episode has ended takes the next one that waits."""
+    """Which episode each row plays: a row whose episode has ended takes the next waiting one."""
 
     def __init__(self, rows: int, episodes: int):
         self.episode = np.arange(rows) % episodes
@@ -94,7 +94,7 @@ class Seats:
         self.finished, self._following, self._episodes = 0, min(rows, episodes), episodes
 
     def pass_on(self, ended: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Seats the next episodes where some have ended; returns the rows with a new one."""
+        """Gives the next episodes to rows whose own have ended; returns the rows with a new one."""
         self.finished += ended.sum()
         rows = np.flatnonzero(ended)[: self._episodes - self._following]
         self.live[ended] = False
@@ -111,7 +111,7 @@ def none_yet(episodes: int) -> Outcomes:
 
 
 def record(outcome: Outcomes, arena: Arena, seats: Seats) -> None:
-    """Notes what the latest step did to the episodes that are live."""
+    """Records the effect of the latest step on the live episodes."""
     episode = seats.episode[seats.live]
     outcome.success[episode] = arena.reached[seats.live]
     outcome.length[episode] = seats.age[seats.live]
@@ -121,7 +121,7 @@ def record(outcome: Outcomes, arena: Arena, seats: Seats) -> None:
 
 
 def held_out_draws(bank: Mapping[str, Any]) -> int:
-    """How many of a bank's draws, its first ones, are kept for evaluation."""
+    """Number of a bank's draws held out for evaluation; they are its first ones."""
     return int(len(bank["spawn"]) * bank["held_out"])
 
 
@@ -135,7 +135,7 @@ def roll_bank(
 ) -> dict:
     """Every outcome of `entries` draws of the scene: arrays (entries, slab, route), and the draws (entries, 3).
 
-    "commit_step" and "held_out" are the bank's, for whatever trains or evaluates on its scenes.
+    "commit_step" and "held_out" are passed on to whatever trains or evaluates on the bank's scenes.
     """
     layout, device = load_layout(config.layout), config.device
     draws = draw_scenes(layout, config.entries, Stream.BANK.generator(seed))

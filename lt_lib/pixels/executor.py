@@ -30,11 +30,11 @@ ENTERED, DISOBEYED, ARRIVED, BLOCKED = (
     -5.0,
     5.0,
     5.0,
-)  # rewards; BLOCKED is reaching a commanded corridor's slab
+)  # rewards; BLOCKED: reaching the slab of the commanded corridor
 
 
 class Executor(nn.Module):
-    """Gaussian policy over body-frame velocities, with a value; 128-128 tanh each."""
+    """Gaussian policy over body-frame velocities, and a value function; 128-128 tanh each."""
 
     def __init__(self):
         super().__init__()
@@ -155,7 +155,7 @@ def train_executor(
 
 
 def _collect(driving: Driving, policy: Executor, config: ExecutorConfig, generator: torch.Generator):
-    """One batch of `rollout` steps in every environment, with advantages; and how many episodes ended and obeyed."""
+    """A batch of `rollout` steps per environment with advantages, and the numbers of episodes that ended and obeyed."""
     steps, ended_count, obedient_count = [], 0, 0
     observation = driving.observe()
     for _ in range(config.rollout):

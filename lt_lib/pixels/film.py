@@ -54,7 +54,7 @@ def record(
 
 
 def pictures(layout: Layout, take: Take, every: int, title: str, height: int = 200) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """Every so many control steps, one captioned picture."""
+    """One captioned picture every `every` control steps."""
     top, eye = TopView(layout, 2 * height), FastCamera(layout, height)
     slab, frames = np.array([take.slab]), []
     for step in range(0, len(take.poses), every):
@@ -99,9 +99,9 @@ def film_pair(
     commit_step: int,
     folder: Path,
 ) -> list[Path]:
-    """Films the first held-out draw once with the first latent head and once with the first floor head, choices greedy.
+    """Films the first held-out draw once with the first latent head and once with the first floor head, greedily.
 
-    The slab stands in the corridor that the floor's head prefers, so that the pair shows what the message is good for.
+    The slab is in the corridor that the floor's head prefers, so that the pair shows what the message contributes.
     """
     draws = Draws(bank["spawn"][:1], bank["scout"][:1])
     frozen, driver = FrozenEncoder(encoder), FrozenExecutor(executor)

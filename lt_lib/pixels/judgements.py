@@ -15,8 +15,8 @@ from lt_lib.store.run import Result
 
 COLLAPSED = 1e-3  # nats of decision entropy below which a head no longer explores
 ALPHA = 0.05
-DROP_ALPHA = 0.001  # of the drop under a destroyed wire, for every head
-AT_CHANCE = (0.35, 0.65)  # route optimality of a destroyed cell
+DROP_ALPHA = 0.001  # for the drop under a destroyed wire, for every head
+AT_CHANCE = (0.35, 0.65)  # route optimality under a destroyed wire
 
 
 def collapsed(head: Result) -> bool:
@@ -49,7 +49,7 @@ def judge_condition(name: str, shares: np.ndarray, floor: np.ndarray, latent: np
 
 
 def judge_redrawn(name: str, shares: np.ndarray, once: np.ndarray, floor: np.ndarray) -> dict[str, Any]:
-    """A cell of the redrawn rows as a finding; its test holds when no seed of one side overlaps the other.
+    """A cell of the redrawn rows as a finding; its test holds if the seeds of the two sides do not overlap.
 
     once   seeds of the same content with one draw per episode: a redrawn row must lie below them
     floor  seeds without a message: the row of one draw must lie above them
@@ -63,7 +63,7 @@ def judge_redrawn(name: str, shares: np.ndarray, once: np.ndarray, floor: np.nda
 
 
 def fall_test(groups: Sequence[ArrayLike]) -> dict[str, Any]:
-    """Whether the means fall from group to group, as a finding; it holds when no seed overlaps the group before.
+    """Whether the means fall from group to group, as a finding; it holds if no seed overlaps the previous group.
 
     p is the largest of the steps' exact one-sided rank tests, since every step must be a fall.
     """

@@ -1,4 +1,4 @@
-"""The content-controlled protocol, stage by stage (Sections Overview, Setup): what the notebooks ask the run store for.
+"""The content-controlled protocol, stage by stage (Sections Overview, Setup), as requests to the run store.
 
 Everything but the message is held fixed: one frozen encoder, one frozen executor, one bank of episodes, one head.
 """
@@ -36,7 +36,7 @@ SEED = 0  # of the one encoder and the one executor, as in the paper; heads have
 class PixelProtocol:
     """The stages at one size.
 
-    weights  a folder of frozen encoder and executor to use, or None: train them
+    weights  folder of the frozen encoder and executor, or None to train them
     """
 
     store: RunStore
@@ -48,14 +48,14 @@ class PixelProtocol:
     def of(
         cls, pixel_study: Mapping[str, Any], layout: str, device: str, workers: int | str, weights: str = ""
     ) -> "PixelProtocol":
-        """From a notebook's parameters. Raises UserError for those that cannot be used."""
+        """From a notebook's parameters. Raises UserError for unusable ones."""
         sizes = validated(PixelsConfig, "pixel_study", pixel_study)
         shared = {"layout": layout, "device": computing_device(device), "latency": sizes.latency}
         sizes = sizes.model_copy(update={name: everywhere(each, shared) for name, each in sizes})
         return cls(RunStore(runs_folder(), workers), sizes, layout, ROOT / weights if weights else None)
 
     def encoders(self) -> dict[str, Result]:
-        """Ours, and what it must beat at the gates: an untrained one, and one trained by prediction alone."""
+        """Our encoder and those it must beat at the gates: an untrained one, and one trained by prediction alone."""
         alone = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
         configs = {
             "ours": self.sizes.encoder,
@@ -74,7 +74,7 @@ class PixelProtocol:
         return dict(zip(encoders, self.store.fetch(runs, "freeze gates"), strict=True))
 
     def encoder_weights(self) -> Result:
-        """Stage 1: E and P once they have passed the gates. Raises GateError if they do not."""
+        """Stage 1: E and P after passing the gates. Raises GateError if they fail."""
         trained = (
             self._kept("encoder")
             if self.weights
@@ -93,13 +93,13 @@ class PixelProtocol:
         return self.store.fetch([Run(train_executor, self.sizes.executor, SEED, {"encoder": encoder})], "executor")[0]
 
     def encoder_facts(self, report: Result) -> dict:
-        """What goes with the frozen encoder: the settings it was trained with and what it showed at the gates."""
+        """What is stored with the frozen encoder: its training settings and its gate measurements."""
         if self.weights:
             return facts_of(self.weights, "encoder")
         return {"settings": self.sizes.encoder.model_dump(), "gates": {name: report[name] for name in Measured._fields}}
 
     def save_executor(self, executor: Result, folder: Path) -> Path:
-        """Keeps the frozen executor beside the frozen encoder."""
+        """Saves the frozen executor beside the frozen encoder."""
         facts = facts_of(self.weights, "executor") if self.weights else {"settings": self.sizes.executor.model_dump()}
         return save_frozen(folder, "executor", executor, load_layout(self.layout), facts)
 
@@ -113,7 +113,7 @@ class PixelProtocol:
         return shards[0] | {name: np.concatenate([shard[name] for shard in shards]) for name in arrays}
 
     def trained_heads(self, seeds: Mapping[str, int], bank: Result, encoder: Result) -> dict[str, list[Result]]:
-        """Stage 2: so many seeds of each condition of Table I, all with the same settings.
+        """Stage 2: the given number of seeds per condition of Table I, all with the same settings.
 
         Rows of REDRAWS among the names are left to `redrawn_heads`.
         """
@@ -128,10 +128,10 @@ class PixelProtocol:
     def redrawn_heads(
         self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result
     ) -> dict[str, list[Result]]:
-        """So many seeds of each row of REDRAWS among the names, trained live on the bank's scenes; and one seed each of
+        """The given number of seeds per row of REDRAWS, trained live on the bank's scenes, and one seed each of
 
         no bonus   the latent drawn at every step, without the entropy bonus that all rows share
-        float32    two batches with one draw an episode: the bank's, episode by episode
+        float32    two batches with one draw per episode, which equal the bank's episode by episode
         """
         scenes = {name: bank[name] for name in SCENES}
         inputs = {"scenes": scenes, "encoder": encoder, "executor": executor}
@@ -154,7 +154,7 @@ class PixelProtocol:
         return results
 
     def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
-        """A frozen trained head under every wire condition of Table IV, greedily."""
+        """A frozen trained head, choosing greedily, under every wire condition of Table IV."""
         inputs = {"head": only(head, "head"), "bank": bank, "encoder": encoder}
         shared = {key: getattr(self.sizes.head, key) for key in ("layout", "device", "latency")}
         shared |= {"content": CONDITIONS[name].content, "episodes": episodes}
@@ -173,5 +173,5 @@ class PixelProtocol:
 
 
 def obedience(bank: Result) -> float:
-    """Share of the bank's episodes in which the executor entered the corridor that it was told to."""
+    """Share of the bank's episodes in which the executor entered the commanded corridor."""
     return float((bank["entered"] == np.arange(ROUTES)).mean())

@@ -1,8 +1,8 @@
 """The route head trained live, its route redrawn every k control steps (Section Restoring temporal abstraction).
 
-Once the route can change on the way, an episode's outcome depends on all its draws, so the episode bank no longer
+Once the route can change during an episode, the outcome depends on all its draws, so the episode bank no longer
 applies: navigator, camera, frozen encoder and frozen executor are stepped while the head learns. With one draw per
-episode (k = 0) it equals `route.train_head`, episode by episode, which is the check on everything here.
+episode (k = 0) the result equals that of `route.train_head` episode by episode, which checks everything here.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,7 +41,7 @@ from lt_lib.store.states import state_of
 
 
 class Redraw(NamedTuple):
-    """How often the route is drawn, and from what: the lower block of Table III, and another reading of it."""
+    """How often the route is drawn, and from what: the lower block of Table III, and an alternative reading of it."""
 
     content: str
     every: int  # control steps, the paper's k; 0: once
@@ -58,10 +58,10 @@ REDRAWS = {
     "k30_gae": Redraw("latent", 30, "gae", "ours", "every 30 steps, discounted credit"),
     "k1_gae": Redraw("latent", 1, "gae", "ours", "every step, discounted credit"),
 }
-SCENES = ("spawn", "scout", "commit_step", "held_out")  # what of an episode bank the live training needs
+SCENES = ("spawn", "scout", "commit_step", "held_out")  # the parts of an episode bank that live training needs
 # Frames are encoded in multiples of this, so that a row's arithmetic does not depend on its neighbours'
 FRAMES_AT_ONCE = 16
-UNSEEN = 255  # no palette index
+UNSEEN = 255  # not a palette index
 
 
 class Decisions(NamedTuple):
@@ -74,19 +74,19 @@ class Decisions(NamedTuple):
 
 
 class FrameMemory:
-    """The last frame of every row and what was made of it, which is made anew only where the frame has changed."""
+    """The last frame of every row and the value computed from it, recomputed only if the frame has changed."""
 
     def __init__(self, rows: int, pixels: int):
         self._frames = np.full((rows, pixels * pixels), UNSEEN, np.uint8).view(np.uint64)
-        self.made: Tensor | None = None  # (rows, width), zeros for a row that showed nothing yet
+        self.made: Tensor | None = None  # (rows, width), zeros for a row that has had no frame
 
     def forget(self, which: Bool[np.ndarray, " n"]):
         self._frames.view(np.uint8)[which] = UNSEEN
 
     def recall(self, rows: Int[np.ndarray, " b"], frames, make: Callable) -> Float[Tensor, "b width"]:
-        """What was made of the frames (B, H, W) of some rows.
+        """The values computed from the frames (B, H, W) of some rows.
 
-        make  takes positions in `rows`, a multiple of FRAMES_AT_ONCE
+        make  computes them from positions in `rows`, a multiple of FRAMES_AT_ONCE
         """
         changed = np.empty(len(rows), bool)
         renew(self._frames, rows, frames.reshape(len(rows), -1).view(np.uint64), changed)
@@ -101,7 +101,7 @@ class FrameMemory:
 
 
 class LiveArena:
-    """Navigators that the frozen executor drives, and the scouts' messages to them, `config.envs` side by side."""
+    """Navigators driven by the frozen executor, and their scouts' messages, `config.envs` side by side."""
 
     def __init__(
         self,
@@ -124,8 +124,8 @@ class LiveArena:
         """Plays E episodes from their draws to the goal or the time-out, redrawing every `config.every` steps.
 
         slab    (E,) 0 left, 1 right: the blocked corridor
-        chance  uniform numbers: draw d of episode e goes right where chance[e, d] is below the head's probability.
-                They come with the episode, so that it does not matter which row plays it, and when.
+        chance  uniform numbers: draw d of episode e goes right if chance[e, d] is below the head's probability.
+                They belong to the episode, so it does not matter which row plays it, or when.
         """
         arena, seats = self._arena, Seats(self._config.envs, len(slab))
         outcome, log = none_yet(len(slab)), []
@@ -158,7 +158,7 @@ class LiveArena:
         return (since == 0) | ((since > 0) & (since % every == 0) if every else False)
 
     def _draw_number(self, age) -> Int[np.ndarray, " n"]:
-        """Which draw of its episode a row lives by, 0 before the first."""
+        """Index of the draw that each row follows, 0 before the first."""
         every = self._config.every or HORIZON
         return np.maximum(age - self._commit_step, 0) // every
 
@@ -188,12 +188,12 @@ class LiveArena:
 
 
 def draws_per_episode(every: int, commit_step: int) -> int:
-    """How many routes are drawn in an episode that lasts to the time-out."""
+    """Number of routes drawn in an episode that times out."""
     return -(-(HORIZON - commit_step) // every) if every else 1
 
 
 def _ordered(log: list, rewards: Float[np.ndarray, "e d"]) -> Decisions:
-    """What was logged step by step, by episode; a stable sort keeps the draws of one in the order of time."""
+    """The step-by-step log, regrouped by episode; a stable sort keeps each episode's draws in time order."""
     episode, wires, routes = zip(*log, strict=True)
     episode = np.concatenate(episode)
     order = np.argsort(episode, kind="stable")
@@ -203,15 +203,15 @@ def _ordered(log: list, rewards: Float[np.ndarray, "e d"]) -> Decisions:
     return Decisions(episode, torch.cat(wires)[order], routes, rewards[episode, number])
 
 
-# --- how a draw is credited: advantages and value targets (D,) of the decisions of some episodes
+# --- credit assignment: advantages and value targets (D,) of the decisions
 def whole_episode(decisions: Decisions, outcome: Outcomes, values: Float[Tensor, " d"], config: PpoConfig):
-    """Every draw with its episode's whole undiscounted return, as the one draw of k = 0 is (Section Route head)."""
+    """Credits every draw with its episode's whole undiscounted return, as for k = 0 (Section Route head)."""
     returns = torch.from_numpy(outcome.returns[decisions.episode]).float()
     return returns - values, returns
 
 
 def generalised(decisions: Decisions, outcome: Outcomes, values: Float[Tensor, " d"], config: PpoConfig):
-    """Generalised advantage estimates over the sequence of draws, discounted a draw; the time-out is an end."""
+    """Generalised advantage estimates over the sequence of draws, discounted per draw; a time-out is terminal."""
     episode = decisions.episode
     time = np.arange(len(episode)) - np.searchsorted(episode, episode)
     reward, value = torch.zeros(2, time.max() + 1, len(outcome.success))
@@ -242,7 +242,7 @@ def train_redrawn_head(
                        optimal when the corridor first entered is the slab-free one
     "entropy", "draws" (updates,) nats per draw, draws in the batch
     """
-    rng = Stream.HEAD.generator(seed)  # the scenes and the chance of `train_head` of this seed
+    rng = Stream.HEAD.generator(seed)  # the same scenes and random numbers as in `train_head` with this seed
     commit_step = scenes["commit_step"]
     arena = LiveArena(config, commit_step, encoder, executor)
     spawn, scout = (scenes[name][held_out_draws(scenes) :] for name in ("spawn", "scout"))

@@ -1,7 +1,7 @@
 """Stage 2: the route head learns from the team's episode return alone (Sections Route head, Rendered pixels).
 
-The head sees the wire and nothing else, the executor cannot see the wire, so the route has one possible source of
-information. One draw per episode, credited with the whole return; nobody tells the head whether it matched the slab.
+The head sees only the wire and the executor cannot see it, so the route has one possible source of information. The
+one draw per episode is credited with the whole return; the head is never told whether it matched the slab.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,7 +43,7 @@ class Bank(NamedTuple):
     def wires(
         self, channel: Channel, entry: Int[np.ndarray, " b"], slab: Int[np.ndarray, " b"]
     ) -> Float[Tensor, "b w"]:
-        """What reaches the navigators of some draws, under either placement, at the commit step."""
+        """What reaches the navigators at the commit step of the given draws and slab placements."""
         sent = self.contents[entry, slab], self.scout[entry]
         return committed_wires(channel, self.commit_step, *sent, self.navigator[entry])
 
@@ -55,7 +55,7 @@ def committed_wires(
     scout: Float[np.ndarray, "b 2"],
     navigator: Float[np.ndarray, "b 2"],
 ) -> Float[Tensor, "b w"]:
-    """What reaches waiting navigators at the commit step from stationary scouts, which send from the first step on."""
+    """What reaches waiting navigators at the commit step from stationary scouts that send from the first step."""
     sent_at, rows = commit_step - channel.latency, np.arange(len(content))
     if sent_at >= 0:
         channel.send(sent_at, content, scout, rows)
@@ -69,7 +69,7 @@ def sent_contents(
     spawn: Float[np.ndarray, "e 3"],
     scout: Float[np.ndarray, "e 3"],
 ) -> Float[Tensor, "e slab c"]:
-    """What the scout sends under either placement while the navigator waits at its spawn."""
+    """What the scout sends under each slab placement while the navigator waits at its spawn."""
     camera, contents = FastCamera(layout), []
     for slab in range(SLABS):
         slabs = np.full(len(spawn), slab)
@@ -91,7 +91,7 @@ def sent_wires(
     scout: Float[np.ndarray, "e 3"],
     commit_step: int,
 ) -> Float[Tensor, "e slab w"]:
-    """What reaches the navigator at the commit step of each draw of the scene, under either placement."""
+    """What reaches the navigator at the commit step of each draw of the scene, under each slab placement."""
     contents = sent_contents(layout, encoder, content, spawn, scout)  # (e, slab, c)
     channel = Channel((SLABS * len(spawn),), contents.shape[-1], layout.communication_radius)
     places = (np.repeat(poses[:, :2], SLABS, axis=0) for poses in (scout, spawn))  # (e * slab, 2)
@@ -125,12 +125,12 @@ def train_head(
     bank: Mapping[str, np.ndarray],
     encoder: Mapping[str, np.ndarray],
 ) -> dict:
-    """Trains one head; returns its weights, what became of every training episode, and a greedy evaluation.
+    """Trains one head; returns its weights, the outcome of every training episode and a greedy evaluation.
 
     "head.*"           weights
     "optimal", "success", "contacts", "length" (episodes,) of the head's sampled choices, in order
     "entropy" (updates,) nats, "value_loss" (updates,)
-    "greedy.*"         the same four over the held-out draws, both placements each, choices greedy
+    "greedy.*"         the same four and "route" of greedy choices over the held-out draws, the slab placed at random
     """
     rng = Stream.HEAD.generator(seed)
     training, held_out = read_bank(config, bank, encoder)
@@ -168,7 +168,7 @@ def train_head(
 
 @torch.no_grad()
 def evaluate(head: RouteHead, held_out: Bank, channel: Channel, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Greedy choices of a frozen head, one episode per sender of the channel, the slab's placement drawn by chance.
+    """Greedy choices of a frozen head, one episode per sender of the channel, the slab placed at random.
 
     The held-out draws are taken in turn. Returns "optimal", "success", "contacts", "length", "route", each (episodes,).
     """
@@ -186,7 +186,7 @@ def _played(
     slab: Int[np.ndarray, " b"],
     route: Int[np.ndarray, " b"],
 ) -> dict[str, np.ndarray]:
-    """What became of episodes: optimal when the committed corridor is the slab-free one."""
+    """Outcomes of episodes; optimal when the committed corridor is the slab-free one."""
     at = (entry, slab, route)
     return {
         "optimal": route != slab,
@@ -206,7 +206,7 @@ def evaluate_head(
     bank: Mapping[str, np.ndarray],
     encoder: Mapping[str, np.ndarray],
 ) -> dict:
-    """One cell of Table IV: a frozen trained head under one wire condition, greedily."""
+    """One cell of Table IV: a frozen trained head, choosing greedily, under one wire condition."""
     _, held_out = read_bank(config, bank, encoder)
     rng = Stream.CORRUPTION.generator(seed)
     channel = channel_of(config, config.episodes, held_out.contents.shape[-1], rng)
