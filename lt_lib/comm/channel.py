@@ -1,6 +1,6 @@
 """The channel, the same for every content: anchor, range, latency (Section Broadcast and anchor).
 
-`CORRUPTIONS` are what can happen to a wire on its way (Section Corruption controls); 'intact' is the channel as it is.
+`CORRUPTIONS` are what can happen to a wire in transit (Section Corruption controls); 'intact' changes nothing.
 """
 
 from collections.abc import Callable
@@ -13,21 +13,21 @@ from torch import Tensor
 from lt_lib.settings.base import LATENCY
 
 ANCHOR = 2  # floats
-NEVER = np.iinfo(np.int64).min  # no step at which anything was sent
+NEVER = np.iinfo(np.int64).min  # marks a slot in which nothing was sent
 
 
 class Channel:
     """Messages in flight from many senders side by side, each to its own receiver.
 
-    What is sent at step t arrives at step t + latency, and at no other. The anchor is the sender's position when it
-    sent, relative to the receiver on arrival, in communication radii. A sender farther away than the radius is not
-    heard, nor one whose message has not arrived: its wire is zeros.
+    A message sent at step t arrives at step t + latency and at no other. The anchor is the sender's position at sending
+    relative to the receiver's at arrival, in communication radii. The wire is zeros for a sender farther away than the
+    radius and for one whose message has not arrived.
 
-    senders  shape of the senders, (b,) or, where each receiver hears n of them, (b, n)
+    senders  shape of the senders, (b,) or, if each receiver hears n of them, (b, n)
     width    floats of the content
     radius   metres
     latency  control steps
-    corrupt  what happens to the wires (..., 2 + width) of one step on their way
+    corrupt  what happens to the wires (..., 2 + width) of one step in transit
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Channel:
     ):
         self.latency, self.senders = latency, senders[0]
         self._radius, self._corrupt = radius, corrupt
-        slots = latency + 1  # as many steps are in flight at once; a step's slot is its remainder
+        slots = latency + 1  # steps in flight at once; a step's slot is its remainder
         self._content = torch.zeros(slots, *senders, width)
         self._sender = np.zeros((slots, *senders, 2))
         self._sent_at = np.full((slots, senders[0]), NEVER)
@@ -52,7 +52,7 @@ class Channel:
         sender: Float[np.ndarray, "b *n 2"],
         rows: Int[np.ndarray, " b"] | None = None,
     ) -> None:
-        """Sends contents at a step, each row at its own if need be, in place of what was sent at that step before.
+        """Sends contents at one step, or one step per row, replacing anything sent at that step before.
 
         rows  the rows that send, all by default
         """
@@ -65,7 +65,7 @@ class Channel:
         receiver: Float[np.ndarray, "b 2"],
         rows: Int[np.ndarray, " b"] | None = None,
     ) -> Float[Tensor, "b *n w"]:
-        """The wires as they reach receivers at their positions at a step."""
+        """The wires that reach receivers at their positions at a step."""
         sent_at = step - self.latency
         slot, rows = self._slots(sent_at, rows)
         sender = self._sender[slot, rows]  # (b, *n, 2)
@@ -95,9 +95,9 @@ def heard(anchor: Float[Tensor, "*b 2"]) -> Bool[Tensor, "*b"]:
 
 
 def measured_latency(latency: int) -> int:
-    """Control steps after which a channel of this latency shows an impulse, sent at one step amid silence.
+    """Control steps until a channel of this latency delivers an impulse sent at one step amid silence.
 
-    Raises ValueError if it shows at any other step than one.
+    Raises ValueError unless it arrives at exactly one step.
     """
     steps, impulse, here = 2 * latency + 4, latency + 1, np.zeros((1, 2))
     channel, shown = Channel((1,), 1, 1.0, latency), []
@@ -123,7 +123,7 @@ def wire_zeroed(wire: Float[Tensor, "b w"], rng: np.random.Generator) -> Float[T
 
 
 def sender_shuffled(wire: Float[Tensor, "b w"], rng: np.random.Generator) -> Float[Tensor, "b w"]:
-    """A real content from another environment, never one's own; the anchor is still this environment's."""
+    """A real content from another environment, never its own; the anchor is still this environment's."""
     order = rng.permutation(len(wire))
     donor = np.empty_like(order)
     donor[order] = np.roll(order, 1)

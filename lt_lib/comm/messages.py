@@ -16,13 +16,13 @@ from lt_lib.envs.layout import Layout
 from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 
 CONTENT = LATENT  # floats, every content but raw
-PATH = CONTENT // 2 - 1  # points of the constant-velocity path beside the position
+PATH = CONTENT // 2 - 1  # points of the constant-velocity path besides the position
 
 
 class Sender(NamedTuple):
-    """What b senders have when they send.
+    """What b senders know when they send.
 
-    `velocity` is in m/s, zero for a stationary scout; `slab` is the truth (0 left, 1 right), for the oracle alone.
+    `velocity` is in m/s, zero for a stationary scout; `slab` is the truth (0 left, 1 right), for the oracle only.
     """
 
     layout: Layout
@@ -77,7 +77,7 @@ def _padded(values) -> Float[Tensor, "b 64"]:
 
 
 class Condition(NamedTuple):
-    """A row of Table I: what is sent, what happens to the wire, and what the comparison needs it for."""
+    """A row of Table I: what is sent, what happens to the wire, and its role in the comparison."""
 
     content: str
     wire: str

@@ -1,4 +1,4 @@
-"""The receiver: one cross-attention layer from the navigator to the messages it got (Section Receiver)."""
+"""The receiver: one cross-attention layer from the navigator to the messages it received (Section Receiver)."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -6,11 +6,11 @@ from torch import Tensor, nn
 
 
 class Receiver(nn.Module):
-    """Masked attention over any number of senders: the ego embedding asks, the messages are keys and values.
+    """Masked attention over any number of senders: the ego embedding is the query, the messages are keys and values.
 
-    The pooled message does not depend on the senders' order, and a sender that is absent contributes exactly zero, as
-    do all of them together. The value projection has no bias and starts at zero, so that every condition starts as the
-    no-message policy. With one sender the attention is 1 whatever the scores, and query and key get no gradient.
+    The pooled message does not depend on the senders' order, and absent senders contribute exactly zero, even if all
+    are. The value projection has no bias and starts at zero, so every condition starts as the no-message policy. With
+    one sender the attention is 1 whatever the scores, so query and key get no gradient.
     """
 
     def __init__(self, ego: int, wire: int, pooled: int):
@@ -29,7 +29,7 @@ class Receiver(nn.Module):
     def attention(
         self, ego: Float[Tensor, "b e"], wires: Float[Tensor, "b n w"], present: Bool[Tensor, "b n"]
     ) -> Float[Tensor, "b n"]:
-        """How much of each sender is read: a softmax over those present, zero for the others."""
+        """Attention weight of each sender: a softmax over those present, zero for the others."""
         keys = self.key(wires)
         scores = (keys @ self.query(ego).unsqueeze(2)).squeeze(2) / keys.shape[-1] ** 0.5
         # a row without any sender has no softmax; the finite fill keeps it, and its gradient, from becoming NaN

@@ -1,1 +1,1 @@
-"""The task for other people's learners: Gymnasium and PettingZoo."""
+"""The task for other people's learners, in Gymnasium and PettingZoo."""

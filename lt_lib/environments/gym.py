@@ -3,9 +3,9 @@
     env = gymnasium.make("lt_lib.environments.gym:LatentTelepathy/Corridors-v0")
 
 An observation is the navigator's own frame (64, 64, 3) uint8, an action a body-frame velocity in [-1, 1]^3. The reward
-is the team's: +1 for arriving, -0.01 for every control step in contact with the slab. Nothing tells which corridor is
-blocked, so this is the silent task; `lt_lib.environments.team` has the teammate who sees it, and
-the channel between the two.
+is the team's: +1 for arriving, -0.01 per control step in contact with the slab. Nothing tells which corridor is
+blocked, so this is the silent task; `lt_lib.environments.team` adds the teammate who sees it and the channel between
+the two.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.envs.reference import TopView
 
 ARRIVAL_REWARD = 1.0
-CONTACT_REWARD = -0.01  # a control step in contact with the slab
+CONTACT_REWARD = -0.01  # per control step in contact with the slab
 
 
 def frame_space(layout: Layout) -> Box:
@@ -38,7 +38,7 @@ def velocity_space() -> Box:
 
 
 class Scenes:
-    """n episodes side by side; a row depends on nothing but its own generator and its own actions.
+    """n episodes side by side; a row depends only on its own generator and actions.
 
     `entered` (n,) is the first corridor entered in the episode: 0 left, 1 right, -1 none yet.
     """
@@ -48,7 +48,7 @@ class Scenes:
         self.entered, self._age = np.full(n, NO_CORRIDOR), np.zeros(n, np.int64)
 
     def restart(self, which: Bool[np.ndarray, " n"], rngs: Sequence[np.random.Generator]):
-        """New episodes in the rows of `which`: spawn, scout and slab are drawn, in this order, by each row's own."""
+        """New episodes in the rows of `which`; each row's generator draws spawn, scout and slab, in this order."""
         layout = self.arena.layout
         pose, slab, scout = self.arena.pose, self.arena.slab.copy(), self.arena.scout.copy()
         for i in np.flatnonzero(which):
@@ -81,14 +81,14 @@ class Scenes:
         return {name: values.item() for name, values in self.infos().items()}
 
     def seen_by(self, view: TopView) -> UInt8[np.ndarray, "h w 3"]:
-        """The only row from above."""
+        """The only row, seen from above."""
         return view.picture(self.arena.pose[0], int(self.arena.slab[0]), self.arena.scout[0])
 
 
 class ArenaEnv(gymnasium.Env):
     """One navigator without messages. Ends on arrival; truncated after 600 steps.
 
-    Raises UserError for an unknown layout, and for `render_mode="rgb_array"` where there is no OpenGL.
+    Raises UserError for an unknown layout, and for `render_mode="rgb_array"` without OpenGL.
     """
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
@@ -100,7 +100,7 @@ class ArenaEnv(gymnasium.Env):
         self._view = TopView(self._scenes.arena.layout) if render_mode else None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """A new episode; `seed` starts the random numbers of this and all later ones. There are no options."""
+        """Starts a new episode; `seed` seeds this and all later ones. There are no options."""
         super().reset(seed=seed)
         self._scenes.restart(np.ones(1, bool), [self.np_random])
         return self._scenes.navigator_frames()[0], self._scenes.info()
@@ -117,7 +117,7 @@ class ArenaEnv(gymnasium.Env):
 class ArenaVectorEnv(VectorEnv):
     """n navigators in one batched arena; row i is `ArenaEnv` with seed + i.
 
-    A row that ended starts anew in the next step, whose action it ignores and whose reward is 0.
+    A row that ended restarts in the next step, which ignores its action and has reward 0.
     """
 
     metadata: ClassVar = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": CONTROL_HZ}
@@ -132,7 +132,7 @@ class ArenaVectorEnv(VectorEnv):
         self._ended = np.zeros(num_envs, bool)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """New episodes everywhere; `seed` starts every row's random numbers. There are no options."""
+        """Starts new episodes everywhere; `seed` seeds every row. There are no options."""
         if seed is not None:
             self._rngs = [np.random.default_rng(seed + i) for i in range(self.num_envs)]
         self._ended[:] = False
@@ -149,7 +149,7 @@ class ArenaVectorEnv(VectorEnv):
         return self._scenes.navigator_frames(), reward, terminated, truncated, self._infos()
 
     def _infos(self) -> dict[str, np.ndarray]:
-        """Gymnasium's form: beside every entry, which rows have it."""
+        """`infos` in Gymnasium's form: beside every entry, a mask of the rows that have it."""
         infos = self._scenes.infos()
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 

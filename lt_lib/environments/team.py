@@ -1,8 +1,8 @@
 """The two-robot team as a PettingZoo environment: a navigator that chooses, a scout that sees, a channel between them.
 
-The scout's action is its message, of any content; the channel is the paper's (Section Broadcast and anchor): what it
-sends reaches the navigator `latency` control steps later, one by default, with the anchor of its arrival. Learners may
-train either robot or both: a frozen encoder as the scout's policy is the paper's own condition.
+The scout's action is its message, of any content. The channel is the paper's (Section Broadcast and anchor): a message
+reaches the navigator `latency` control steps later, one by default, with the anchor at its arrival. Learners may train
+either robot or both; a frozen encoder as the scout's policy is the paper's own condition.
 """
 
 from typing import Any, ClassVar
@@ -25,11 +25,11 @@ NAVIGATOR, SCOUT = "navigator", "scout"
 
 
 class TeamEnv(ParallelEnv):
-    """Both robots get the team's reward, and end together: on the navigator's arrival, or after 600 steps.
+    """Both robots get the team's reward and end together: on the navigator's arrival or after 600 steps.
 
     navigator  observes {"frame": own frame (64, 64, 3) uint8, "wire": (2 + content,) float32, zeros before the first
-               message arrives}; acts by a body-frame velocity in [-1, 1]^3
-    scout      observes its own frame (64, 64, 3) uint8; acts by a message (content,) float32; it stands still
+               message arrives}; acts with a body-frame velocity in [-1, 1]^3
+    scout      observes its own frame (64, 64, 3) uint8; acts with a message (content,) float32; stands still
 
     Raises UserError for an unknown layout, for a latency below 1, and for `render_mode="rgb_array"` without OpenGL.
     """
@@ -62,7 +62,7 @@ class TeamEnv(ParallelEnv):
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None):
-        """A new episode; `seed` starts the random numbers of this and all later ones. There are no options."""
+        """Starts a new episode; `seed` seeds this and all later ones. There are no options."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         self._scenes.restart(np.ones(1, bool), [self._rng])
