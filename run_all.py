@@ -1,10 +1,10 @@
-"""The whole reproduction: executes the notebooks in order and says how each went.
+"""The whole reproduction: executes the notebooks in order and reports how each went.
 
     python run_all.py [--profile full|quick|smoke] [--only NAME ...] [--workers N | --scheduler ADDRESS]
                        [--outputs DIR] [--runs DIR] [--list]
 
-Exit status: 0 all well, 1 a notebook failed, 2 bad input (nothing was computed), 129, 130 or 143 interrupted by a
-closed terminal, by Ctrl-C or by SIGTERM.
+Exit status: 0 success, 1 a notebook failed, 2 bad input (nothing was computed), 129, 130 or 143 interrupted by a closed
+terminal, Ctrl-C or SIGTERM.
 """
 
 import argparse
@@ -34,27 +34,27 @@ from lt_lib.store.files import claimed, runs_folder, writable_folder
 from lt_lib.store.manifest import stages_since, write_manifest
 from lt_lib.store.progress import Progress, read_progress
 
-# Without these the later notebook can only fail too; the scoreboard joins whatever is there.
+# Without these the notebook can only fail too; the scoreboard joins whatever is there.
 NEEDS = {
     "04_pixels": ("02_encoder",),
     "05_coverage_sweep": ("02_encoder",),
     "07_corruption": ("03_gridworld", "04_pixels"),
     "10_speed": ("03_gridworld", "04_pixels"),
 }
-# What this script gives to every notebook, over what the profile says.
+# What this script gives to every notebook, overriding the profile.
 GIVEN = ("profile", "outputs", "workers")
-# What names things that may not exist or not fit; checked before computing.
+# Parameters naming things that may be missing or unfit; checked before computing.
 INPUTS = ("device", "layout", "weights", "seeds", "gridworld", "peek_layout", "frames", "effects", "gate_file")
 # A notebook whose code calls this draws with OpenGL.
 DRAWS = "require_opengl()"
-# What ends us as Ctrl-C does; SIGHUP is a closed terminal. Not every system has it.
+# Signals that end us as Ctrl-C does, where the system has them; SIGHUP is a closed terminal.
 SIGNALS = [number for name in ("SIGTERM", "SIGHUP") if (number := getattr(signal, name, None))]
 CELL_LIMIT_S = 6 * 3600
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to execute, checked: notebooks in order, the parameters and the code of each, and where everything goes.
+    """What to execute, checked: notebooks in order, the parameters and code of each, and where everything goes.
 
     runs: the folder of finished runs
     scheduler: the address of the Dask cluster that computes, '' for this machine
@@ -81,7 +81,7 @@ class Outcome:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that leaves the printing of errors to us."""
+    """A parser that raises errors instead of printing them."""
 
     def error(self, message: str) -> None:
         raise UserError(message)
@@ -95,18 +95,18 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
     except UserError as error:
         print(f"run_all: {error}", file=sys.stderr)
         return 2
-    except OSError as error:  # a disk that fills up, a folder that becomes read-only or goes away
-        print(f"run_all: {error}; finished runs are kept, the same command goes on from there", file=sys.stderr)
+    except OSError as error:  # a full disk, a folder that became read-only or vanished
+        print(f"run_all: {error}; finished runs are kept, the same command resumes from there", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
         logging.getLogger("asyncio").disabled = True  # papermill's abandoned cell would complain at exit
-        with contextlib.suppress(OSError):  # a closed terminal cannot be told
-            print("run_all: interrupted; finished runs are kept, the same command goes on from there", file=sys.stderr)
+        with contextlib.suppress(OSError):  # the terminal may be closed
+            print("run_all: interrupted; finished runs are kept, the same command resumes from there", file=sys.stderr)
         return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
 def run(options: argparse.Namespace, root: Path) -> int:
-    """Does what the options say; returns the exit status. Raises UserError before it computes."""
+    """Carries out the options; returns the exit status. Raises UserError before computing."""
     if options.list:
         print("\n".join(notebook_names(root)))
         return 0
@@ -136,7 +136,7 @@ def ended_by_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def kernels_environment(plan: Plan) -> Iterator[None]:
-    """What notebooks find in their environment: this library, the folder of runs, no backend (figures need none)."""
+    """The notebooks' environment: this library, the folder of runs, no backend (figures need none)."""
     library = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     with mock.patch.dict(os.environ, {"LT_RUNS": str(plan.runs), "PYTHONPATH": library}):
         os.environ.pop("MPLBACKEND", None)
@@ -144,19 +144,19 @@ def kernels_environment(plan: Plan) -> Iterator[None]:
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = Parser(prog="run_all.py", description="Executes the notebooks in order and says how each went.")
-    parser.add_argument("--profile", default="full", help="a file of params/: full (default), quick or smoke")
+    parser = Parser(prog="run_all.py", description="Executes the notebooks in order and reports how each went.")
+    parser.add_argument("--profile", default="full", help="a file in params/: full (default), quick or smoke")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels")
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one per core)")
-    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="a Dask cluster's, tcp://HOST:PORT")
-    parser.add_argument("--outputs", type=Path, metavar="DIR", help="default: outputs/<profile>")
-    parser.add_argument("--runs", type=Path, metavar="DIR", help="of finished runs; default: outputs/runs")
-    parser.add_argument("--list", action="store_true", help="name the notebooks and stop")
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
+    parser.add_argument("--outputs", type=Path, metavar="DIR", help="folder of outputs; default: outputs/<profile>")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="folder of finished runs; default: outputs/runs")
+    parser.add_argument("--list", action="store_true", help="list the notebooks and stop")
     options = parser.parse_args(arguments)
     if options.workers < 0:
         raise UserError(f"argument --workers: expected 0 or more, got {options.workers}")
     if options.workers and options.scheduler:
-        raise UserError("argument --scheduler: its cluster has the workers; leave --workers out")
+        raise UserError("argument --scheduler: the cluster provides the workers; leave --workers out")
     return options
 
 
@@ -164,7 +164,7 @@ def make_plan(options: argparse.Namespace, root: Path) -> Plan:
     """Raises UserError for anything unknown or mistyped in the options, the profile or the notebooks."""
     profile = load_profile(options.profile, root)
     chosen = choose(options.only, list(profile)) if options.only else list(profile)
-    # The default stays empty, so that executed notebooks do not depend on where the project lies.
+    # The default stays empty, so that executed notebooks do not depend on the project's location.
     outputs = str(options.outputs.resolve()) if options.outputs else ""
     workers = options.scheduler or options.workers
     given = dict(zip(GIVEN, (options.profile, outputs, workers), strict=True))
@@ -194,12 +194,12 @@ def choose(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
     meant = {name: {name, name[:2], str(int(name[:2])), name[3:]} for name in names}
     for word in wanted:
         if not any(word in aliases for aliases in meant.values()):
-            raise UserError(f"argument --only: unknown notebook {word!r}; there are {', '.join(names)}")
+            raise UserError(f"argument --only: unknown notebook {word!r}; known: {', '.join(names)}")
     return [name for name in names if meant[name] & set(wanted)]
 
 
 def preflight(plan: Plan) -> None:
-    """Everything that can be known to be wrong before computing. Raises UserError."""
+    """Raises UserError for everything that can be known to be wrong before computing."""
     checked: list[dict[str, Any]] = []
     for name, given in plan.parameters.items():
         declared = notebook_defaults(plan.root / "notebooks" / f"{name}.ipynb")
@@ -207,7 +207,7 @@ def preflight(plan: Plan) -> None:
         if missing:
             raise UserError(f"{name}.ipynb: its parameters cell must declare {', '.join(sorted(missing))}")
         inputs = {key: value for key, value in (declared | given).items() if key in INPUTS}
-        if inputs not in checked:  # notebooks share most of theirs
+        if inputs not in checked:  # notebooks share most inputs
             check_inputs(inputs, plan.root)
             checked.append(inputs)
     if any(DRAWS in cell for name in plan.parameters for cell in code_cells(plan.root, name)):
@@ -217,13 +217,13 @@ def preflight(plan: Plan) -> None:
     kept = [plan.outputs / name for name in ("logs", "notebooks", "results")]
     for folder in (plan.outputs, *kept):
         writable_folder(folder)
-    writable_folder(plan.runs, "name another by --runs")
+    writable_folder(plan.runs, "name another with --runs")
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         print("run_all: NUMBA_DISABLE_JIT is set: loops run uncompiled, a hundred times slower", file=sys.stderr)
 
 
 def execute_all(plan: Plan) -> dict[str, Outcome]:
-    """Executes every notebook whose needs did not fail, prints a line each, writes the manifest and the report."""
+    """Executes every notebook whose needs did not fail, prints a line for each, writes the manifest and the report."""
     outcomes: dict[str, Outcome] = {}
     for name in plan.parameters:
         failed = [need for need in NEEDS.get(name, ()) if need in outcomes and outcomes[need].status != "ok"]
@@ -241,7 +241,7 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
 
 
 def execute(plan: Plan, name: str) -> Outcome:
-    """Executes one notebook. It went well if no cell raised and it wrote its results anew."""
+    """Executes one notebook. It succeeds if no cell raises and it rewrites its results."""
     log = plan.outputs / "logs" / f"{name}.log"
     results = plan.outputs / "results" / f"{name}.json"
     before = results.stat().st_mtime_ns if results.exists() else None
@@ -258,16 +258,16 @@ def execute(plan: Plan, name: str) -> Outcome:
 
 
 def edited(plan: Plan, name: str) -> str:
-    """What is wrong if a notebook's code is no longer the one that was checked: its outputs are not the code's."""
+    """The error if a notebook's code has changed since it was checked, so that its outputs do not match; else ''."""
     try:
         same = code_digest(plan.root, name) == plan.code[name]
-    except (OSError, ValueError, KeyError, TypeError):  # it is gone, or half written
+    except (OSError, ValueError, KeyError, TypeError):  # missing or half written
         same = False
-    return "" if same else f"notebooks/{name}.ipynb was edited meanwhile; the same command executes the new one"
+    return "" if same else f"notebooks/{name}.ipynb was edited during the run; the same command executes the new one"
 
 
 def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
-    """Executes a notebook into <outputs>/notebooks, its output into a log; returns what went wrong, or ''."""
+    """Executes a notebook into <outputs>/notebooks and logs its output; returns the error, or ''."""
     import papermill  # takes seconds, which bad input need not wait for
 
     from lt_lib.store.kernel import OwnKernel
@@ -292,7 +292,7 @@ def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
     except papermill.PapermillExecutionError as error:
         log.write(str(error))
         return f"cell {error.cell_index}: {error.ename}: {first_line(error.evalue)}"
-    except (RuntimeError, OSError, ValueError) as error:  # a dead kernel, a cell over its time, a full disk
+    except (RuntimeError, OSError, ValueError) as error:  # a dead kernel, a cell over its time limit, a full disk
         log.write(traceback.format_exc())
         return f"{type(error).__name__}: {first_line(str(error))}"
     return ""
@@ -300,7 +300,7 @@ def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
 
 @contextlib.contextmanager
 def stderr_into(file: TextIO) -> Iterator[None]:
-    """Sends what this process and those that it starts say on stderr into a file."""
+    """Redirects stderr of this process and its children to a file."""
     kept = os.dup(2)
     os.dup2(file.fileno(), 2)
     try:
@@ -312,7 +312,7 @@ def stderr_into(file: TextIO) -> Iterator[None]:
 
 @contextlib.contextmanager
 def live_line(name: str, runs: Path) -> Iterator[None]:
-    """While the block runs, tells how far its runs are: in one live line on a terminal, else in several."""
+    """While the block runs, reports progress: in one live line on a terminal, else in several."""
     done = threading.Event()
     tell = tell_terminal if sys.stdout.isatty() else tell_file
     thread = threading.Thread(target=tell, args=(name, runs, done), daemon=True)
@@ -333,7 +333,7 @@ def tell_terminal(name: str, runs: Path, done: threading.Event) -> None:
 
 
 def tell_file(name: str, runs: Path, done: threading.Event) -> None:
-    """One line when a stage begins and one a minute after that."""
+    """Prints one line when a stage begins and one per minute after that."""
     started = time.monotonic()
     told, due = "", 0.0
     while not done.wait(0.5):
@@ -357,7 +357,7 @@ def clock(seconds: float) -> str:
 
 
 def shown(path: Path, root: Path) -> str:
-    """A path as seen from the project's root, if it lies in there."""
+    """A path, relative to the project's root if it lies inside."""
     return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
 
@@ -366,7 +366,7 @@ def first_line(text: str) -> str:
 
 
 def print_summary(scoreboard: Path) -> None:
-    """How many claims got which verdict, e.g. 'scoreboard: 41 reproduced, 3 same direction'."""
+    """Prints the number of claims per verdict, e.g. 'scoreboard: 41 reproduced, 3 same direction'."""
     with scoreboard.open(encoding="utf-8", newline="") as file:
         verdicts = Counter(row["verdict"] for row in csv.DictReader(file))
     print("scoreboard: " + ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common()))

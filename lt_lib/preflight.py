@@ -1,4 +1,4 @@
-"""Everything that can be wrong with a notebook's parameters, checked before computing."""
+"""Checks everything that can be wrong with a notebook's parameters before computing."""
 
 import subprocess
 import sys
@@ -13,9 +13,9 @@ KINDS = ("encoder", "executor")  # what a weights folder holds
 
 
 def settled(parameters: Mapping[str, Any], root: Path = ROOT) -> dict[str, Any]:
-    """The parameters, with `weights` emptied where it names outputs of a profile that was never run.
+    """The parameters, with `weights` emptied if it names outputs of a profile that was never run.
 
-    An empty `weights` means to train. A folder elsewhere that does not exist is a mistake, and stays to be found.
+    Empty `weights` means training. A missing folder elsewhere is a mistake and is left for `check_inputs` to find.
     """
     folder = root / parameters.get("weights", "")
     never_run = folder.is_relative_to(root / "outputs") and not folder.is_dir()
@@ -23,10 +23,10 @@ def settled(parameters: Mapping[str, Any], root: Path = ROOT) -> dict[str, Any]:
 
 
 def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
-    """Raises UserError, one line, for what cannot work.
+    """Raises a one-line UserError for parameters that cannot work.
 
-    A device that is not there, an impossible or revealing layout, unusable weights, an unknown condition or camera
-    effect, an invalid gate file, a folder of real frames with a mistake in it.
+    These are a missing device, an impossible or revealing layout, unusable weights, an unknown condition or camera
+    effect, an invalid gate file, and a faulty folder of real frames.
     """
     if "device" in parameters:
         from lt_lib.settings.devices import computing_device
@@ -54,15 +54,15 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
 
 
 def check_opengl() -> None:
-    """Raises UserError, one line, unless OpenGL opens here; tried in a separate process, which a driver may end."""
+    """Raises a one-line UserError unless OpenGL opens here; tried in a separate process, which a driver may crash."""
     command = [sys.executable, "-m", "lt_lib.envs.opengl"]
     tried = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if tried.returncode:
-        raise UserError(tried.stdout.strip() or f"OpenGL ends a process that opens it (exit status {tried.returncode})")
+        raise UserError(tried.stdout.strip() or f"OpenGL crashes on opening (exit status {tried.returncode})")
 
 
 def check_cluster(address: str) -> None:
-    """Raises UserError, one line, unless a scheduler with workers of our versions answers at an address."""
+    """Raises a one-line UserError unless a scheduler whose workers have our versions answers at the address."""
     from lt_lib.store.cluster import connected  # here, since Dask takes a second to import
 
     with connected(address):

@@ -146,7 +146,7 @@ def test_a_worker_with_another_version_is_refused_with_both_versions(small_clust
     theirs = small_cluster.client.run(cluster.identity)
     (address,) = (worker for worker, found in theirs.items() if found != cluster.identity())
     ours, name = cluster.identity()[cluster.OURS], cluster.OURS
-    expected = f"worker {address} has {name} {theirs[address][name]}, here it is {ours}; start it with this version"
+    expected = f"worker {address} has {name} {theirs[address][name]}, expected {ours}; start it with this version"
     assert_refused(project, capfd, small_cluster.address, expected)
     small_cluster.leave(other)
 
@@ -154,8 +154,8 @@ def test_a_worker_with_another_version_is_refused_with_both_versions(small_clust
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"torch": "0.1"}, "^worker tcp://there:1 has torch 0.1, here it is 2; start it with this version$"),
-        ({"torch": None}, "^worker tcp://there:1 has no torch, here it is 2; start it with this version$"),
+        ({"torch": "0.1"}, "^worker tcp://there:1 has torch 0.1, expected 2; start it with this version$"),
+        ({"torch": None}, "^worker tcp://there:1 has no torch, expected 2; start it with this version$"),
     ],
 )
 def test_other_libraries_are_refused(change, complaint):
@@ -168,12 +168,12 @@ def test_other_libraries_are_refused(change, complaint):
 
 def test_code_edited_after_a_process_began_is_told(monkeypatch):
     monkeypatch.setattr(cluster, "LOADED", "before")
-    assert cluster.identity()[cluster.OURS].endswith(f"(code before, edited since to {cluster.code_digest()})")
+    assert cluster.identity()[cluster.OURS].endswith(f"(code before, since edited to {cluster.code_digest()})")
 
 
 def test_a_worker_that_finds_other_source_than_the_key_s_does_not_compute(small_cluster, tmp_path, monkeypatch):
     monkeypatch.setattr("lt_lib.store.run.source_digest", lambda *_, folder: "other")
-    with pytest.raises(RunError, match="other source or another layout for train_toy"):
+    with pytest.raises(RunError, match="different source or a different layout for train_toy"):
         RunStore(tmp_path, small_cluster.address).fetch(toys(1), "toys")
     assert not kept_files(tmp_path)
 

@@ -217,7 +217,7 @@ source.write_text(source.read_text().replace("range(count)", "range(1)"))"""
 def test_a_notebook_edited_while_it_runs_has_failed_and_the_next_time_the_new_one_runs(project, capfd):
     write_notebook(project, "02_encoder", COMPUTE, WRITE, EDIT)
     assert smoke(project, "--only", "02") == 1
-    complaint = "notebooks/02_encoder.ipynb was edited meanwhile; the same command executes the new one"
+    complaint = "notebooks/02_encoder.ipynb was edited during the run; the same command executes the new one"
     assert complaint in capfd.readouterr().out
     write_notebook(project, "02_encoder", COMPUTE.replace("range(count)", "range(1)"), WRITE)
     assert smoke(project, "--only", "02") == 0

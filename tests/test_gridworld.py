@@ -397,7 +397,7 @@ def test_an_untrained_encoder_fails_the_gates(encoder):
 
 def test_an_unknown_content_is_refused_before_anything_is_computed(tmp_path, encoder):
     protocol = GridProtocol(RunStore(tmp_path / "runs", 1), PatchEncoderConfig(), PatchGates(), GridConfig())
-    with pytest.raises(UserError, match="unknown message content 'telepathy'; there are floor, position"):
+    with pytest.raises(UserError, match="unknown message content 'telepathy'; known: floor, position"):
         protocol.trained({"telepathy": 1}, encoder)
     assert not (tmp_path / "runs").exists()
 

@@ -237,7 +237,7 @@ def test_a_sweep_changes_one_thing_on_the_same_placements():
         assert len(set(changed)) == len(strengths)
         assert with_effect(changed[0], effect, strengths[-1]) == changed[-1]
         assert SessionConfig() in changed  # the nominal strength is one of them
-    with pytest.raises(UserError, match="unknown effect 'rain'; there are distortion, "):
+    with pytest.raises(UserError, match="unknown effect 'rain'; known: distortion, "):
         with_effect(SessionConfig(), "rain", 1.0)
 
 
@@ -479,7 +479,7 @@ def saved_again(folder: Path) -> None:
 
 BAD = {
     "missing file": (lambda f: (f / "refit_3.png").unlink(), r"labels.csv row 5: refit_3.png is missing"),
-    "unknown session": (edited("live", "lunch", 20), r"labels.csv row 20: unknown session 'lunch'; there are refit, "),
+    "unknown session": (edited("live", "lunch", 20), r"labels.csv row 20: unknown session 'lunch'; known: refit, "),
     "unknown lighting": (edited("bright", "sunny", 2), r"labels.csv row 2: unknown lighting 'sunny'"),
     "unknown hazard": (lambda f: edited(read_hazard(f, 4), ",yes", 4)(f), r"labels.csv row 4: unknown hazard 'yes'"),
     "no placement": (edited(",2,", ",two,", 4), r"labels.csv row 4: placement must be a whole number"),
@@ -522,7 +522,7 @@ def test_a_bad_folder_gives_one_clear_line_with_its_row_before_anything_runs(cas
 
 
 def test_an_unknown_effect_and_a_missing_gate_file_are_told_before_anything_runs(good_folder):
-    with pytest.raises(UserError, match="effects: unknown camera effect 'rain'; there are distortion, "):
+    with pytest.raises(UserError, match="effects: unknown camera effect 'rain'; known: distortion, "):
         check_inputs(inputs(good_folder) | {"effects": ["blur", "rain"]})
     with pytest.raises(UserError, match="^none.yaml: cannot be read"):
         check_inputs(inputs(good_folder) | {"gate_file": "params/gates/none.yaml"})

@@ -210,7 +210,7 @@ def test_without_a_picture_triton_is_not_imported(no_opengl):
 def test_a_notebook_of_another_checkout_is_refused_in_one_line(checkout, monkeypatch):
     monkeypatch.chdir(checkout / "notebooks")
     complaint = (
-        f"this notebook lies in {checkout}, the library that it imports in {ROOT}; start Jupyter with PYTHONPATH"
+        f"this notebook is in {checkout}, but the library that it imports is in {ROOT}; start Jupyter with PYTHONPATH"
     )
     with pytest.raises(UserError, match=re.escape(complaint)):
         outputs_folder("", "smoke")
@@ -365,7 +365,7 @@ def test_a_read_only_checkout_without_a_home_runs_with_outputs_and_runs_elsewher
         shutil.copytree(ROOT / "lt_lib", disk / "library" / "lt_lib", ignore=shutil.ignore_patterns("__pycache__"))
         subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
         assert smoke(disk / "project", "--outputs", str(tmp_path / "outputs")) == 2
-        assert capfd.readouterr().err.endswith("Read-only file system; name another by --runs\n")
+        assert capfd.readouterr().err.endswith("Read-only file system; name another with --runs\n")
         elsewhere = ["--outputs", str(tmp_path / "outputs"), "--runs", str(tmp_path / "runs")]
         assert smoke(disk / "project", "--only", "02", *elsewhere) == 0
         code = "import numpy as np, lt_lib.perception.renewal as r; r.renew(*np.zeros((4, 1, 1), np.int64))"
@@ -412,7 +412,7 @@ try:
 except UserError as error:
     print(error)"""
     ended = python(code)
-    assert ended.stdout == f"{tmp_path} belongs to another user's run; name another folder by --outputs\n", ended.stderr
+    assert ended.stdout == f"{tmp_path} belongs to another user's run; name another with --outputs\n", ended.stderr
 
 
 # --- signals, clocks, terminals, systems

@@ -141,7 +141,7 @@ def test_preflight_refuses_what_the_notebooks_would_only_find_later(tmp_path):
         ({"layout": "maze"}, "unknown layout 'maze'; known: default"),
         ({"layout": "leaking"}, "the navigator sees the"),
         ({"layout": "default", "weights": str(tmp_path)}, "encoder.safetensors is missing"),
-        ({"seeds": {"smoke signals": 2}}, "unknown message condition 'smoke signals'; there are latent"),
+        ({"seeds": {"smoke signals": 2}}, "unknown message condition 'smoke signals'; known: latent"),
     ):
         with pytest.raises(UserError, match=complaint):
             check_inputs(inputs)

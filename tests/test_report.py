@@ -351,7 +351,7 @@ def test_a_finding_cannot_be_pending_too(tmp_path, few):
 
 
 def test_unknown_notebooks_and_unwritable_folders_are_refused(tmp_path, few):
-    with pytest.raises(UserError, match="unknown notebook '4_pixels'; there are 01_occlusion_check"):
+    with pytest.raises(UserError, match="unknown notebook '4_pixels'; known: 01_occlusion_check"):
         Findings("4_pixels", tmp_path, "full", few)
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write in the folder"):

@@ -25,9 +25,9 @@ from run_all import choose, clock, describe, main
 @pytest.mark.parametrize(
     ("yaml", "complaint"),
     [
-        ("04_pixel: {}", "smoke.yaml: unknown notebook '04_pixel'; there are 02_encoder, 03_gridworld"),
-        ("shared: {seed: 2}", "smoke.yaml: shared: no notebook declares 'seed'; there are content, "),
-        ("02_encoder: {seed: 2}", "smoke.yaml: 02_encoder: unknown parameter 'seed'; there are content, "),
+        ("04_pixel: {}", "smoke.yaml: unknown notebook '04_pixel'; known: 02_encoder, 03_gridworld"),
+        ("shared: {seed: 2}", "smoke.yaml: shared: no notebook declares 'seed'; known: content, "),
+        ("02_encoder: {seed: 2}", "smoke.yaml: 02_encoder: unknown parameter 'seed'; known: content, "),
         ("02_encoder: {count: '2'}", "smoke.yaml: 02_encoder: count: expected int such as 2, got '2'"),
         ("02_encoder: {count: true}", "smoke.yaml: 02_encoder: count: expected int such as 2, got True"),
         ("02_encoder: {count: 2.0}", "smoke.yaml: 02_encoder: count: expected int such as 2, got 2.0"),
@@ -48,8 +48,8 @@ from run_all import choose, clock, describe, main
         ),
         ("02_encoder: 3", "smoke.yaml: 02_encoder: expected its parameters "),
         ("- 3", "smoke.yaml: expected sections such as 'shared:', got [3]"),
-        ("02_encoder: {toy: [", "smoke.yaml: not valid yaml: "),
-        ("02_encoder: {}\n02_encoder: {count: 3}", "smoke.yaml: not valid yaml: '02_encoder' is given twice"),
+        ("02_encoder: {toy: [", "smoke.yaml: not valid YAML: "),
+        ("02_encoder: {}\n02_encoder: {count: 3}", "smoke.yaml: not valid YAML: '02_encoder' is given twice"),
     ],
 )
 def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml, complaint):
@@ -60,18 +60,18 @@ def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml,
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--profile", "tiny"], "unknown profile 'tiny'; there are smoke"),
-        (["--profile", "claims"], "unknown profile 'claims'; there are smoke"),
-        (["--profile", "../params/smoke"], "unknown profile '../params/smoke'; there are smoke"),
+        (["--profile", "tiny"], "unknown profile 'tiny'; known: smoke"),
+        (["--profile", "claims"], "unknown profile 'claims'; known: smoke"),
+        (["--profile", "../params/smoke"], "unknown profile '../params/smoke'; known: smoke"),
         (
             ["--profile", "smoke", "--only", "pixels"],
-            "argument --only: unknown notebook 'pixels'; there are 02_encoder",
+            "argument --only: unknown notebook 'pixels'; known: 02_encoder",
         ),
         (["--profile", "smoke", "--workers", "-1"], "argument --workers: expected 0 or more, got -1"),
         (["--profile", "smoke", "--workers", "two"], "argument --workers: invalid int value: 'two'"),
         (
             ["--profile", "smoke", "--workers", "2", "--scheduler", "tcp://localhost:8786"],
-            "argument --scheduler: its cluster has the workers; leave --workers out",
+            "argument --scheduler: the cluster provides the workers; leave --workers out",
         ),
         (
             ["--profile", "smoke", "--scheduler", "localhost"],

@@ -165,7 +165,7 @@ def test_every_hardware_setting_of_a_profile_reaches_its_runs(profile):
     ],
 )
 def test_what_a_study_decides_run_by_run_is_refused_in_a_profile(kind, name, value, place):
-    with pytest.raises(UserError, match=f"^{place}: the study decides this, run by run; leave it out$"):
+    with pytest.raises(UserError, match=f"^{place}: the study sets this for each run; leave it out$"):
         validated(kind, name, value)
 
 

@@ -1,4 +1,4 @@
-"""What all settings share: their base, the scene and the device, and the one-line error for people."""
+"""What all settings share: their base, the scene, the device, and the one-line error for users."""
 
 import hashlib
 from collections.abc import Collection, Iterable, Mapping
@@ -12,18 +12,18 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class UserError(Exception):
-    """A mistake in what a person gave us; its one line names it and says what would be right."""
+    """A mistake in the user's input; its one line names the mistake and says what is expected."""
 
 
 def require_known(names: Iterable[str], known: Collection[str], what: str, where: str = "") -> None:
-    """Raises UserError for the first of the names of some `what` that is not a known one; `where`: 'seeds: '."""
+    """Raises UserError for the first unknown name of a `what`; `where` is a prefix such as 'seeds: '."""
     for name in names:
         if name not in known:
-            raise UserError(f"{where}unknown {what} {name!r}; there are {', '.join(known)}")
+            raise UserError(f"{where}unknown {what} {name!r}; known: {', '.join(known)}")
 
 
 def read_yaml(path: Path) -> Any:
-    """What a yaml file holds. Raises UserError, one line, if it cannot be read."""
+    """A YAML file's content. Raises a one-line UserError if it cannot be read."""
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:
@@ -31,15 +31,15 @@ def read_yaml(path: Path) -> Any:
 
 
 def _frozen(value: Any) -> Any:
-    """Lists as tuples, at any depth, since yaml and notebooks can only write lists."""
+    """Lists as tuples, at any depth, since YAML and notebooks can only write lists."""
     return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
 
 
 class Settings(BaseModel):
-    """Base of every configuration: immutable, strictly typed, no unknown keys; lists are taken for tuples."""
+    """Base of every configuration: immutable, strictly typed, no unknown keys; lists become tuples."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-    decided: ClassVar[tuple[str, ...]] = ()  # fields that a study decides, run by run; a profile may not set them
+    decided: ClassVar[tuple[str, ...]] = ()  # fields that a study sets for each run; a profile may not set them
 
     @model_validator(mode="before")
     @classmethod
@@ -53,7 +53,7 @@ LAYOUTS = ROOT / "params" / "layouts"
 
 
 def layout_path(name: str) -> Path:
-    """The file of a layout: params/layouts/<name>.yaml, or the path of any yaml file.
+    """The file of a layout: params/layouts/<name>.yaml, or the path of any YAML file.
 
     Raises UserError for an unknown name.
     """
@@ -68,7 +68,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 Precision = Literal["float32", "bfloat16"]
-LATENCY = 1  # control steps between sending and arriving, the paper's
+LATENCY = 1  # control steps from sending to arrival, as in the paper
 
 
 class Scene(Settings):
@@ -80,7 +80,7 @@ class Scene(Settings):
     @computed_field
     @property
     def layout_digest(self) -> str:
-        """sha256 of the layout's file, so that an edited scene is another setting."""
+        """sha256 of the layout's file, so that an edited scene is a different setting."""
         return hashlib.sha256(layout_path(self.layout).read_bytes()).hexdigest()
 
 
@@ -92,16 +92,16 @@ class Training(Scene):
 
 
 def everywhere(settings: Any, shared: Mapping[str, Any]) -> Any:
-    """Settings with what is shared put into those of its fields that they have; anything else as it is."""
+    """Settings with the shared values that they have fields for; anything else unchanged."""
     if not isinstance(settings, Settings):
         return settings
     return settings.model_copy(update={name: value for name, value in shared.items() if hasattr(settings, name)})
 
 
 def refuse_decided(value: Any, name: str) -> None:
-    """Raises UserError if settings, at any depth, were given a field that their study decides run by run."""
+    """Raises UserError if settings, at any depth, were given a field that their study sets for each run."""
     if isinstance(value, Settings):
         for field in value.model_fields_set:
             if field in value.decided:
-                raise UserError(f"{name}.{field}: the study decides this, run by run; leave it out")
+                raise UserError(f"{name}.{field}: the study sets this for each run; leave it out")
             refuse_decided(getattr(value, field), f"{name}.{field}")

@@ -10,7 +10,7 @@ from lt_lib.settings.ppo import PpoConfig
 
 
 class PatchEncoderConfig(ObjectiveConfig):
-    """Stage 1 in the gridworld, which has about a hundred views where the pixels have any number."""
+    """Stage 1 in the gridworld, which has about a hundred views; the pixel scene has unlimited ones."""
 
     layout: str = "grid"
     variance: NonNegativeFloat = 1.0
@@ -18,7 +18,7 @@ class PatchEncoderConfig(ObjectiveConfig):
 
 
 class PatchGateConfig(Scene):
-    """How the gridworld's freeze gates are measured: cross-validation over cells, so many folds."""
+    """How the gridworld's freeze gates are measured: cross-validation over cells."""
 
     layout: str = "grid"
     folds: Annotated[int, Field(ge=2)] = 10
@@ -58,11 +58,11 @@ class GridEvaluationConfig(Scene):
 
 
 class GridworldConfig(Settings):
-    """All that the gridworld's protocol needs, in one parameter; every stage takes the section's layout."""
+    """All settings of the gridworld's protocol in one parameter; every stage uses its layout."""
 
     layout: str = "grid"
     latency: NonNegativeInt = LATENCY  # steps
     encoder: PatchEncoderConfig = PatchEncoderConfig()
     gates: PatchGates = PatchGates()
     policy: GridConfig = GridConfig()
-    seeds: dict[str, PositiveInt]  # how many of each content
+    seeds: dict[str, PositiveInt]  # number per content

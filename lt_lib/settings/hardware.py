@@ -9,12 +9,12 @@ from lt_lib.settings.perception import EncoderConfig
 
 
 class MatchedEncoderConfig(EncoderConfig):
-    """Stage 1 at the camera's optics, floor and walls recoloured in every rollout (Section Hardware)."""
+    """Stage 1 with the camera's optics; floor and walls are recoloured in every rollout (Section Hardware)."""
 
     decided = (*EncoderConfig.decided, "colour", "texture")
     layout: str = "matched"
     frames: PositiveInt = 102_400
-    colour: Share = 1.0  # of a material's own colour that a random one replaces; 0 leaves the simulation's
+    colour: Share = 1.0  # of a material's colour that a random one replaces; 0 keeps the simulation's
     texture: NonNegativeFloat = 0.0  # standard deviation of the blotches on floor and walls, as a share of their colour
 
 
@@ -31,14 +31,14 @@ class MatchedGateConfig(Training):
 class OpticsConfig(Settings):
     """The surrogate camera from lens to file; every field is an effect, its strength and its unit."""
 
-    distortion: NonNegativeFloat = 0.1  # k: what is seen at radius r (focal lengths) lies at r (1 + k r^2); a barrel
+    distortion: NonNegativeFloat = 0.1  # k: image radius r (focal lengths) shows what lies at r (1 + k r^2); barrel
     vignetting: Share = 0.3  # share of the light lost in the frame's corner
-    blur: NonNegativeFloat = 1.5  # pixels that the picture moves during an exposure, in a random direction
+    blur: NonNegativeFloat = 1.5  # pixels of image motion during an exposure, in a random direction
     exposure: NonNegativeFloat = 0.25  # stops, standard deviation of the drift from frame to frame
     balance: NonNegativeFloat = 0.08  # standard deviation of the log gain of red and of blue
     full_well: PositiveFloat = 4_000.0  # electrons at white: shot noise
     read_noise: NonNegativeFloat = 6.0  # electrons rms
-    mosaic: bool = True  # one colour a pixel, the others interpolated (Bayer)
+    mosaic: bool = True  # one colour per pixel, the others interpolated (Bayer)
     jpeg: Annotated[int, Field(ge=1, le=100)] = 80  # quality
 
 
@@ -46,23 +46,23 @@ class BenchConfig(Settings):
     """How the robot stands in front of a corridor, and what else is there."""
 
     turn: Annotated[float, Field(gt=0, lt=90)] = 18.0  # degrees off the centre line, towards the corridor in question
-    position: NonNegativeFloat = 3.0  # cm, +- of the robot's place by hand
-    heading: NonNegativeFloat = 2.0  # degrees, +- of its heading by hand
+    position: NonNegativeFloat = 3.0  # cm, +- error of placing the robot by hand
+    heading: NonNegativeFloat = 2.0  # degrees, +- error of its heading by hand
     clutter: Annotated[int, Field(ge=0, le=12)] = 4  # objects on the floor
-    dim: NonNegativeFloat = 1.0  # stops by which the dim state's light is turned down, besides a lamp that is off
+    dim: NonNegativeFloat = 1.0  # stops by which the dim state's light is lowered, besides a lamp that is off
 
 
 class SessionConfig(Scene):
-    """One session: a number of placements, a few frames of each."""
+    """One session: a number of placements, a few frames per placement."""
 
     layout: str = "matched"
     hazard: PositiveInt = 19  # placements with the slab in the corridor in question
     clear: PositiveInt = 15  # placements with the slab in the other one
     shots: PositiveInt = 3  # frames per placement
-    frames: NonNegativeInt = 0  # the session ends after so many; 0: after the last placement
+    frames: NonNegativeInt = 0  # the session ends after this many; 0: after the last placement
     near: PositiveFloat = 120.0  # cm from the camera to the slab's front
     far: PositiveFloat = 250.0  # cm
-    marks: NonNegativeInt = 0  # distances, evenly from near to far; 0: anywhere between
+    marks: NonNegativeInt = 0  # distances, evenly spaced from near to far; 0: anywhere between
     lighting: tuple[Literal["bright", "dim"], ...] = ("bright", "dim")  # taken in turn
     bench: BenchConfig = BenchConfig()
     optics: OpticsConfig = OpticsConfig()
@@ -83,16 +83,16 @@ class SessionsConfig(Settings):
 
 
 class SweepConfig(SessionConfig):
-    """One effect at rising strengths, everything else as in `SessionConfig`; the placements are the same at each."""
+    """One effect at increasing strengths, otherwise as in `SessionConfig`; all strengths share the placements."""
 
-    effect: str  # a name in perception.sessions.EFFECTS
+    effect: str  # a name in hardware.sessions.EFFECTS
     hazard: PositiveInt = 10
     clear: PositiveInt = 10
     shots: PositiveInt = 2
 
 
 class RailsConfig(Training):
-    """How bang-bang an executor is: on frames of held-out rollouts, under both routes."""
+    """How bang-bang an executor is, on frames of held-out rollouts, under both routes."""
 
     layout: str = "matched"
     rollouts: PositiveInt = 64
@@ -100,7 +100,7 @@ class RailsConfig(Training):
 
 
 class HardwareGates(Settings):
-    """params/gates/hardware.yaml, whose head explains it; fixed before any camera frame was looked at."""
+    """params/gates/hardware.yaml, explained at its top; fixed before any camera frame was seen."""
 
     candidates: Annotated[dict[str, dict[Literal["colour", "texture"], Share]], Field(min_length=1)]
     hazard: Share

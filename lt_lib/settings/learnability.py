@@ -6,7 +6,7 @@ from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from lt_lib.settings.base import Settings
 
-UPDATES_PER_LOOK = 25  # updates of the point-mass study between two looks at it
+UPDATES_PER_LOOK = 25  # updates between two looks at the point-mass study
 
 
 Budget = Annotated[int, Field(gt=0, multiple_of=UPDATES_PER_LOOK)]
@@ -26,8 +26,8 @@ class PointMassConfig(Settings):
     batch: Annotated[int, Field(ge=2)] = 128  # episodes per update
     budgets: Annotated[tuple[Budget, ...], Field(min_length=1)] = (
         1_000,
-    )  # updates after which success is measured, in order; the last one ends the training
-    evaluation: PositiveInt = 8_192  # episodes of a measurement
+    )  # updates after which success is measured, increasing; the last ends the training
+    evaluation: PositiveInt = 8_192  # episodes per measurement
 
     @model_validator(mode="after")
     def _budgets_in_order(self) -> "PointMassConfig":

@@ -27,7 +27,7 @@ class EncoderConfig(ObjectiveConfig, Training):
 
 
 class GateConfig(Training):
-    """How the freeze gates are measured: held-out rollouts, and how many latents to show."""
+    """How the freeze gates are measured: held-out rollouts, and the number of latents to show."""
 
     rollouts: Annotated[int, Field(ge=10)] = 640
     length: PositiveInt = 32

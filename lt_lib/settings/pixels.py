@@ -22,8 +22,8 @@ class ExecutorConfig(Training):
 class BankConfig(Training):
     """One shard of the episode bank: the frozen executor on every (draw of the scene, slab, route).
 
-    The bank owns the draws that are held out for evaluation and the step at which a route is commanded: whatever
-    trains or evaluates on its scenes reads both from it.
+    The bank defines the draws held out for evaluation and the step at which a route is commanded; whatever trains or
+    evaluates on its scenes reads both from it.
     """
 
     entries: PositiveInt = 256  # draws of spawn and scout pose
@@ -58,13 +58,13 @@ class EvaluationConfig(Training):
 
 
 class RedrawConfig(Training):
-    """The route head trained live, its route drawn anew every so many control steps (lower block of Table III)."""
+    """The route head trained live, its route redrawn every `every` control steps (lower block of Table III)."""
 
     decided = (*Training.decided, "content", "every", "credit", "latency")
     content: str = "latent"  # a name in comm.messages.CONTENTS
     latency: NonNegativeInt = LATENCY  # control steps
-    every: NonNegativeInt = 0  # control steps between draws, the paper's k; 0: one draw an episode
-    credit: str = "episode"  # a name in learners.redraw.CREDITS
+    every: NonNegativeInt = 0  # control steps between draws, the paper's k; 0: one draw per episode
+    credit: str = "episode"  # a name in pixels.redraw.CREDITS
     episodes: PositiveInt = 6_000
     batch: PositiveInt = 256  # episodes
     minibatch: PositiveInt = 64  # episodes' worth of draws
@@ -75,7 +75,7 @@ class RedrawConfig(Training):
 
 
 class PixelsConfig(Settings):
-    """All that the pixel protocol needs, in one parameter; layout and device are parameters of their own."""
+    """All settings of the pixel protocol in one parameter; layout and device are separate parameters."""
 
     latency: NonNegativeInt = LATENCY  # control steps, of every channel
     encoder: EncoderConfig = EncoderConfig()

@@ -20,7 +20,7 @@ from lt_lib.settings.velocity import Configuration, NavigatorConfig, RolloutConf
 
 
 def profile_names(root: Path = ROOT) -> list[str]:
-    """The profiles of a project: every yaml file in params/ but the paper's claims."""
+    """The profiles of a project: every YAML file in params/ but the paper's claims."""
     return sorted(path.stem for path in (root / "params").glob("*.yaml") if path.stem != "claims")
 
 
@@ -30,7 +30,7 @@ def notebook_names(root: Path = ROOT) -> list[str]:
 
 
 def notebook_defaults(path: Path) -> dict[str, Any]:
-    """The names and literal values assigned in the one cell of a notebook that is tagged 'parameters'."""
+    """The names and literal values assigned in a notebook's one cell tagged 'parameters'."""
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     tagged = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
     if len(tagged) != 1:
@@ -43,10 +43,10 @@ def notebook_defaults(path: Path) -> dict[str, Any]:
 
 
 def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
-    """What a profile gives to each notebook: {notebook: {parameter: value}}, everything checked.
+    """What a profile gives to each notebook, checked: {notebook: {parameter: value}}.
 
-    A notebook's own section goes over `shared`, whose keys reach every notebook that declares them. A value
-    replaces the notebook's default as a whole, dicts included.
+    A notebook's own section overrides `shared`, whose keys reach every notebook that declares them. A value replaces
+    the notebook's whole default, dicts included.
 
     Raises UserError for an unknown profile, notebook or parameter, or a value of the wrong type or range.
     """
@@ -65,7 +65,7 @@ def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
 
 
 class _UniqueKeys(yaml.SafeLoader):
-    """yaml as it is meant: a key given twice is an error, not the last one's win."""
+    """YAML in which a key given twice is an error; by default the last one wins."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         for key, count in Counter(self.construct_object(key) for key, _ in node.value).items():
@@ -75,11 +75,11 @@ class _UniqueKeys(yaml.SafeLoader):
 
 
 def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dict[str, Any]]:
-    """The sections of a profile's file, once every notebook and every shared parameter in it is known."""
+    """The sections of a profile's file. Raises UserError for an unknown notebook or shared parameter."""
     try:
         sections = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeys) or {}
     except yaml.YAMLError as error:
-        raise UserError(f"{path.name}: not valid yaml: {' '.join(str(error).split())}") from None
+        raise UserError(f"{path.name}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(sections, dict):
         raise UserError(f"{path.name}: expected sections such as 'shared:', got {sections!r}")
     for section, values in sections.items():
@@ -91,14 +91,14 @@ def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dic
     for key in sections.get("shared", {}):
         if key not in declared:
             known = _listed(declared)
-            raise UserError(f"{path.name}: shared: no notebook declares {key!r}; there are {known}")
+            raise UserError(f"{path.name}: shared: no notebook declares {key!r}; known: {known}")
     return sections
 
 
 def _check_value(where: str, key: str, value: Any, declared: Mapping[str, Any]) -> None:
     """A parameter must be declared by its notebook, have the type of its default, and satisfy SECTIONS."""
     if key not in declared:
-        raise UserError(f"{where}: unknown parameter {key!r}; there are {_listed(declared)}")
+        raise UserError(f"{where}: unknown parameter {key!r}; known: {_listed(declared)}")
     if not _same_type(value, declared[key]):
         expected = type(declared[key]).__name__
         raise UserError(f"{where}: {key}: expected {expected} such as {declared[key]!r}, got {value!r}")
@@ -108,11 +108,11 @@ def _check_value(where: str, key: str, value: Any, declared: Mapping[str, Any]) 
         except UserError as error:
             raise UserError(f"{where}: {error}") from None
     elif isinstance(value, dict):
-        raise UserError(f"{where}: {key}: SECTIONS has no settings for it; there are {_listed(SECTIONS)}")
+        raise UserError(f"{where}: {key}: SECTIONS has no settings for it; known: {_listed(SECTIONS)}")
 
 
 def validated(kind: Any, name: str, value: Any) -> Any:
-    """What a notebook's or a profile's parameter means. Raises UserError, one line, if it cannot be used."""
+    """A notebook's or profile's parameter as validated settings. Raises a one-line UserError if it is unusable."""
     try:
         settings = TypeAdapter(kind).validate_python(value, strict=True)
     except ValidationError as error:
@@ -122,14 +122,14 @@ def validated(kind: Any, name: str, value: Any) -> Any:
 
 
 def _same_type(value: Any, default: Any) -> bool:
-    """Whether a value may stand for a default: the same type, int for float, lists item by item."""
+    """Whether a value may replace a default: the same type, int for float, lists item by item."""
     if isinstance(default, list) and isinstance(value, list) and default:
         return all(any(_same_type(item, example) for example in default) for item in value)
     return type(value) is type(default) or (type(default) is float and type(value) is int)
 
 
 def explain(error: ValidationError, name: str, settings: Any) -> str:
-    """The first complaint of pydantic in one line, e.g. 'encoder.frames: must be greater than 0, got -1'."""
+    """Pydantic's first complaint in one line, e.g. 'encoder.frames: must be greater than 0, got -1'."""
     first = error.errors()[0]
     place = ".".join([name, *map(str, first["loc"])])
     if first["type"] == "extra_forbidden":
@@ -141,7 +141,7 @@ def explain(error: ValidationError, name: str, settings: Any) -> str:
 
 
 def _inside(settings: Any, part: str | int) -> Any:
-    """The type of what settings have under a name, or of the items of a list or dict of settings."""
+    """The type of a field of settings, or of the items of a list or dict of settings."""
     if hasattr(settings, "model_fields"):
         return settings.model_fields[part].annotation
     return next(kind for kind in reversed(get_args(settings)) if kind is not ...)
@@ -151,7 +151,7 @@ def _listed(names: Any) -> str:
     return ", ".join(sorted(names))
 
 
-# How the profiles' and notebooks' parameters of these names are checked: settings by their class, others by type.
+# How profile and notebook parameters of these names are checked: settings by their class, others by type.
 SECTIONS: dict[str, Any] = {
     "pixel_study": PixelsConfig,
     "executor": ExecutorConfig,

@@ -1,4 +1,4 @@
-"""Settings of the timings of notebook 10."""
+"""Settings of the timings in notebook 10."""
 
 from typing import Annotated
 
@@ -7,14 +7,14 @@ from pydantic import Field, PositiveInt
 from lt_lib.settings.base import Settings
 from lt_lib.settings.learnability import Budget
 
-Sizes = Annotated[tuple[PositiveInt, ...], Field(min_length=3)]  # that a slope is fitted through
+Sizes = Annotated[tuple[PositiveInt, ...], Field(min_length=3)]  # points of a fitted slope
 
 
 class Stretch(Settings):
     """How much of the real work notebook 10 times, and at which sizes."""
 
-    rounds: PositiveInt  # in which all sides take turns
-    scenes: PositiveInt  # draws of the scene behind either precision
+    rounds: PositiveInt  # in each, all sides take turns
+    scenes: PositiveInt  # draws of the scene, at either precision
     live: PositiveInt  # episodes
     navigator: PositiveInt  # control steps of a navigator's training, profiled
     frames: PositiveInt  # of a matched encoder's training, profiled

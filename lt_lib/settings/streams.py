@@ -7,7 +7,7 @@ import numpy as np
 
 @unique
 class Stream(IntEnum):
-    """What random numbers are for. A number, once used, stays: another one is another result."""
+    """What random numbers are for. A number never changes once used, since another one gives another result."""
 
     ENCODER = 0
     EXECUTOR = 1

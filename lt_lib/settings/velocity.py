@@ -30,9 +30,9 @@ class NavigatorConfig(Training):
     content: str = "floor"  # a name in comm.messages.CONTENTS
     latency: NonNegativeInt = LATENCY  # control steps
     blocked: Literal["random", "left", "right"] = "random"  # the slab's corridor; a fixed one leaves no choice
-    hazard: NonNegativeFloat = 1.0  # penalty of reaching the slab
-    starts: Literal["anywhere", "beyond"] = "beyond"  # the curriculum's: the free arena, or past the mouths alone
-    spawn_share: Share = 0.5  # episodes that start at the spawn whatever the curriculum says
+    hazard: NonNegativeFloat = 1.0  # penalty for reaching the slab
+    starts: Literal["anywhere", "beyond"] = "beyond"  # the curriculum's: the free arena, or only past the mouths
+    spawn_share: Share = 0.5  # of episodes that start at the spawn regardless of the curriculum
     boost: Boost = Boost()
     steps: PositiveInt = 655_360  # 80 updates
     envs: PositiveInt = 128
@@ -64,7 +64,7 @@ class RolloutConfig(Training):
     blocked: Literal["random", "left", "right"] = "random"
     truthful: bool = True  # whether an oracle's message is true or flipped
     rows: Annotated[tuple[Exploration, ...], Field(min_length=1)] = (Exploration(),)
-    episodes: PositiveInt = 128  # a row
+    episodes: PositiveInt = 128  # per row
     paths: NonNegativeInt = 24  # episodes per row whose path is kept
     horizon: PositiveInt = 600  # control steps
     precision: Precision = "float32"

@@ -1,1 +1,1 @@
-"""The run store: every run computed once, here or on a cluster, and kept whole."""
+"""The run store: every run is computed once, locally or on a cluster, and stored whole."""

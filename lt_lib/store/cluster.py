@@ -1,7 +1,7 @@
-"""A Dask cluster as workers: a process computes a run only if it would compute what we would.
+"""A Dask cluster as workers: a worker computes a run only if its result would equal ours.
 
-What a result depends on is compared twice: for all workers before computing starts, and by the worker for each run,
-since workers may join later and files may change under them.
+Everything that a result depends on is compared twice: for all workers before computing starts, and by the worker for
+each run, since workers may join and files may change later.
 """
 
 import contextlib
@@ -27,53 +27,53 @@ from lt_lib.store.run import Packed, Run, Submit, compute, library_versions
 
 OURS = "latent-telepathy-compendium"
 ADDRESS = re.compile(r"(tcp|tls)://(\[[0-9a-fA-F:.]+\]|[\w.-]+):\d{1,5}")
-ANSWER_S = 10  # how long a scheduler may take to answer, and to have a worker
+ANSWER_S = 10  # seconds within which a scheduler must answer and have a worker
 TOPIC = "latent-telepathy-progress"
 
 
 def require_address(address: str) -> None:
-    """Raises UserError for what is no address of a scheduler."""
+    """Raises UserError for an invalid scheduler address."""
     if not ADDRESS.fullmatch(address):
         raise UserError(f"expected a scheduler's address such as tcp://127.0.0.1:8786, got {address!r}")
 
 
 def code_digest() -> str:
-    """The start of the sha256 of the library's files, as they are on the disk of this process."""
+    """The first 12 digits of the sha256 of the library's files on this process's disk."""
     folder = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
-        text = path.read_text(encoding="utf-8")  # whatever its line ends
+        text = path.read_text(encoding="utf-8")  # line endings do not count
         digest.update(f"{path.relative_to(folder).as_posix()}\n{text}\0".encode())
     return digest.hexdigest()[:12]
 
 
-LOADED = code_digest()  # a worker lives long, and goes on with the code that it began with
+LOADED = code_digest()  # a long-lived worker keeps running the code it started with
 
 
 def identity() -> dict[str, str]:
-    """What this process computes with, by name: our version and code, and the versions of libraries."""
+    """What this process computes with, by name: our version and code, and library versions."""
     try:
         version = metadata.version(OURS)
     except metadata.PackageNotFoundError:
         version = "not installed"
     now = code_digest()
-    edited = "" if now == LOADED else f", edited since to {now}"
+    edited = "" if now == LOADED else f", since edited to {now}"
     return {OURS: f"{version} (code {LOADED}{edited})", **library_versions()}
 
 
 def require_same(expected: Mapping[str, str], found: Mapping[str, str], worker: str) -> None:
-    """Raises UserError naming both versions where a worker's differs from ours."""
+    """Raises UserError naming both versions if a worker's differs from ours."""
     for name, version in expected.items():
         if found.get(name) != version:
             theirs = f"{name} {found[name]}" if name in found else f"no {name}"
-            raise UserError(f"worker {worker} has {theirs}, here it is {version}; start it with this version")
+            raise UserError(f"worker {worker} has {theirs}, expected {version}; start it with this version")
 
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[distributed.Client]:
-    """A client of a scheduler with workers, each of one thread and with our versions.
+    """A client of a scheduler whose workers have one thread each and our versions.
 
-    Raises UserError, one line, for a bad address, no answer, no workers, or a worker that is not fit.
+    Raises a one-line UserError for a bad address, no answer, no workers or an unfit worker.
     """
     require_address(address)
     try:
@@ -88,7 +88,7 @@ def connected(address: str) -> Iterator[distributed.Client]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silences Dask's log: our one line reports a failed connection."""
+    """Silences Dask's log, since our own message reports a failed connection."""
     logger = logging.getLogger("distributed")
     before = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -112,7 +112,7 @@ def _require_workers(client: distributed.Client, address: str) -> None:
     for worker, found in client.run(identity, on_error="return").items():
         if isinstance(found, BaseException):
             reason = f"{type(found).__name__}: {found}"
-            raise UserError(f"worker {worker} cannot load {OURS} ({reason}), here it is {expected[OURS]}")
+            raise UserError(f"worker {worker} cannot load {OURS} ({reason}), expected {expected[OURS]}")
         require_same(expected, found, worker)
 
 
@@ -144,21 +144,21 @@ def cluster_workers(address: str, progress: Path) -> Iterator[Submit]:
 def compute_there(run: Run, key: str, expected: Mapping[str, str]) -> Packed:
     """Computes one run in a worker of a cluster.
 
-    Raises UserError if the worker has other versions, code or layouts than those the key was made with, or lacks the
-    device that the key names.
+    Raises UserError if the worker's versions, code or layouts differ from those of the key, or if it lacks the device
+    that the key names.
     """
     worker = distributed.get_worker()
     require_same(expected, identity(), worker.address)
     if "device" in type(run.config).model_fields:
         require_device(run.config.device, worker.address)
     if run.key() != key:
-        raise UserError(f"worker {worker.address} has other source or another layout for {run}; bring it up to date")
+        raise UserError(f"worker {worker.address} has different source or a different layout for {run}; update it")
     with one_thread():
         return compute(run, lambda fraction: worker.log_event(TOPIC, {"key": key, "fraction": fraction}))
 
 
 def require_device(device: str, worker: str) -> None:
-    """Raises UserError, naming the worker that this process is, if it lacks a device."""
+    """Raises UserError naming this worker if it lacks a device."""
     try:
         computing_device(device)
     except UserError as error:
@@ -167,8 +167,8 @@ def require_device(device: str, worker: str) -> None:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Gives the numerical libraries of this process one thread, those that are loaded and those that will be."""
-    # A loaded numba refuses another value than it found at first.
+    """Limits this process's numerical libraries to one thread, whether already loaded or not."""
+    # Once loaded, numba refuses any value but the one it found.
     unread = [name for name in ONE_THREAD if name != "NUMBA_NUM_THREADS" or "numba" not in sys.modules]
     os.environ.update({name: ONE_THREAD[name] for name in unread})
     for library in {"torch", "numba"} & set(sys.modules):

@@ -1,4 +1,4 @@
-"""The kernel that executes a notebook: this very interpreter, whatever a kernelspec of the user's names."""
+"""The kernel that executes a notebook: this interpreter, whatever the user's kernelspecs name."""
 
 from ipykernel.kernelspec import get_kernel_dict
 from jupyter_client.kernelspec import KernelSpec

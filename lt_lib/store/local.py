@@ -15,7 +15,7 @@ from joblib.externals.loky import get_reusable_executor
 from lt_lib.store.progress import write_fraction
 from lt_lib.store.run import Submit, compute
 
-IDLE_S = 60  # after which a worker without a run ends
+IDLE_S = 60  # after which an idle worker exits
 ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -32,14 +32,14 @@ ONE_THREAD = dict.fromkeys(
 def local_workers(processes: int, source: str, progress: Path) -> Iterator[Submit]:
     """Worker processes of one thread each, which end with this process, however it ends, and if the block fails.
 
-    They are kept for the next stage, since each takes seconds to start; not if they were started from another
-    `source`, because theirs must be the one that was digested.
+    They are kept for the next stage, since each takes seconds to start, unless they were started from another `source`:
+    workers must run the source that was digested.
     """
     pool = get_reusable_executor(
         processes, timeout=IDLE_S, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(), source)
     )
     try:
-        with warnings.catch_warnings():  # loky replaces a worker that has grown or idled, and says so each time
+        with warnings.catch_warnings():  # loky warns whenever it replaces a worker that has grown or idled
             warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
             yield lambda key, run: pool.submit(compute, run, partial(write_fraction, progress / f"{key}.json"))
     except BaseException:
@@ -48,10 +48,10 @@ def local_workers(processes: int, source: str, progress: Path) -> Iterator[Submi
 
 
 def _end_with(parent: int, source: str) -> None:
-    """Lets this worker end soon after its parent, even after one that was killed; `source` tells it from others."""
+    """Ends this worker soon after its parent, even a killed parent; `source` tells it from other workers."""
 
     def watch() -> None:
-        while os.getppid() == parent and psutil.pid_exists(parent):  # Windows keeps the number of a dead parent
+        while os.getppid() == parent and psutil.pid_exists(parent):  # Windows keeps a dead parent's id
             time.sleep(0.5)
         os._exit(1)
 

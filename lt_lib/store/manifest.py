@@ -17,9 +17,9 @@ from lt_lib.store.files import write_atomically
 
 
 def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str, Mapping[str, Any]]) -> None:
-    """Writes the manifest; what an earlier one says of notebooks that did not run this time stays.
+    """Writes the manifest; earlier entries of notebooks that did not run this time are kept.
 
-    notebooks: {name: {"status": text, "seconds": float, "stages": as of `stages_since`}} of this time.
+    notebooks: {name: {"status": text, "seconds": float, "stages": as from `stages_since`}} of this time.
     """
     earlier = _notebooks_in(path)
     commit = git_state(root)
@@ -34,18 +34,18 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
 
 
 def _notebooks_in(path: Path) -> dict[str, Any]:
-    """What an earlier manifest says of notebooks; nothing if there is none, or, with a warning, if it is damaged."""
+    """The notebooks of an earlier manifest; empty if it is missing or, with a warning, damaged."""
     if not path.exists():
         return {}
     try:
         return dict(json.loads(path.read_text(encoding="utf-8"))["notebooks"])
     except (ValueError, KeyError, TypeError):
-        logging.getLogger(__name__).warning("%s is damaged: it is rewritten", path)
+        logging.getLogger(__name__).warning("%s is damaged and will be rewritten", path)
         return {}
 
 
 def stages_since(journal: Path, position: int) -> dict[str, dict[str, int | float]]:
-    """Runs computed since the journal was `position` bytes long: {function: {"runs": count, "seconds": workers'}}."""
+    """Runs computed since the journal was `position` bytes long: {function: {"runs": count, "seconds": total}}."""
     stages: dict[str, dict[str, int | float]] = {}
     if journal.exists():
         for line in journal.read_bytes()[position:].splitlines():
@@ -57,7 +57,7 @@ def stages_since(journal: Path, position: int) -> dict[str, dict[str, int | floa
 
 
 def versions(requirements: Path) -> dict[str, str]:
-    """Python's version and that of every library pinned in a requirements file, as they are installed."""
+    """Installed versions of Python and of every library pinned in a requirements file."""
     names = re.findall(r"^([\w.-]+)==", requirements.read_text(encoding="utf-8"), flags=re.MULTILINE)
     return {"python": platform.python_version()} | {name: metadata.version(name) for name in names}
 
@@ -77,7 +77,7 @@ def git_state(root: Path) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores that we may use, and memory in GiB."""
+    """System, CPU, usable cores, and memory in GiB."""
     info = Path("/proc/cpuinfo")
     models = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", flags=re.MULTILINE)
     return {

@@ -1,6 +1,6 @@
-"""How far the runs in flight are, reported through small files, since each runs in its own process.
+"""Progress of the runs in flight, reported through small files, since each runs in its own process.
 
-`<store>/inflight/<process>/stage.json` tells of one fetch, `<key>.json` beside it of one of its runs.
+`<store>/inflight/<process>/stage.json` describes one fetch, `<key>.json` beside it one of its runs.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 
 class Reporter:
-    """What a run calls with its fraction done, 0 to 1; it is passed on to `tell` twice a second at most."""
+    """What a run calls with its fraction done, 0 to 1; passes it on to `tell` at most twice per second."""
 
     def __init__(self, tell: Callable[[float], None]) -> None:
         self._tell = tell
@@ -31,15 +31,15 @@ class Reporter:
 
 
 def write_fraction(path: Path, fraction: float) -> None:
-    """Leaves a run's fraction done in the file that belongs to it."""
+    """Writes a run's fraction done to its file."""
     _write(path, {"fraction": fraction})
 
 
 @contextlib.contextmanager
 def stage(folder: Path, what: str, total: int) -> Iterator[tuple[Path, Callable[[str], None]]]:
-    """Tells of `total` runs until the block ends: (folder for reporters' files, to call with a finished key).
+    """Reports on `total` runs until the block ends: (folder for reporters' files, to call with a finished key).
 
-    On a terminal it draws a bar besides.
+    On a terminal it also draws a bar.
     """
     files = folder / "inflight" / str(os.getpid())
     files.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ def stage(folder: Path, what: str, total: int) -> Iterator[tuple[Path, Callable[
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a fetch stands: runs done, the fraction with those in flight, seconds so far and to come."""
+    """State of a fetch: runs done, the fraction including those in flight, seconds so far and left."""
 
     what: str
     done: int
@@ -73,7 +73,7 @@ class Progress:
 
 
 def read_progress(folder: Path, since: float) -> Progress | None:
-    """The fetch in a store that was last to start, if it was at or after `since` (seconds of `time.monotonic`)."""
+    """The latest fetch in a store, if it started at or after `since` (seconds of `time.monotonic`)."""
     alive = [path for path in folder.glob("inflight/*/stage.json") if psutil.pid_exists(int(path.parent.name))]
     stages = [(told["started"], path, told) for path in alive if (told := _read(path))]
     started, path, told = max(stages, default=(0.0, None, None), key=lambda stage: stage[0])
@@ -87,14 +87,14 @@ def read_progress(folder: Path, since: float) -> Progress | None:
 
 
 def _forget_ended(inflight: Path) -> None:
-    """Removes what killed processes left."""
+    """Removes the files of killed processes."""
     for files in inflight.iterdir():
         if not psutil.pid_exists(int(files.name)):
             rmtree(files, ignore_errors=True)
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    """Writes a file if it can: nothing is lost with it, and no run should be, say to a full disk."""
+    """Writes a file if possible; losing it costs nothing, and a full disk must not cost a run."""
     with contextlib.suppress(OSError):
         temporary = path.with_suffix(".new")
         temporary.write_text(json.dumps(content), encoding="utf-8")
@@ -102,7 +102,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What a file tells; nothing if it went away meanwhile or is damaged."""
+    """A file's content; empty if it has vanished or is damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):

@@ -27,9 +27,9 @@ from lt_lib.store.sources import source_digest
 Result = dict[str, Any]
 
 Packed = tuple[bytes, float]  # a packed result and the seconds it took
-Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run, given with its key
+Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run, given its key
 
-# What a result may change with besides our own code.
+# What a result may depend on besides our own code.
 LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn", "opencv-python-headless")
 
 
@@ -44,10 +44,10 @@ class Run:
 
     def __post_init__(self) -> None:
         if self.function.__module__ == "__main__" or "." in self.function.__qualname__:
-            raise ValueError(f"{self.function.__qualname__} must be a module's own function for workers to import it")
+            raise ValueError(f"{self.function.__qualname__} must be a module-level function for workers to import")
 
     def key(self) -> str:
-        """sha256 of all that the result depends on: call, contents of inputs, source, library versions."""
+        """sha256 of everything that the result depends on: call, contents of inputs, source, library versions."""
         module = sys.modules[self.function.__module__]
         folder = Path(module.__file__).resolve().parents[module.__name__.count(".")]
         parts = {
@@ -67,22 +67,22 @@ class Run:
 
 
 def compute(run: Run, tell: Callable[[float], None]) -> Packed:
-    """Computes one run in a worker, which tells how far it is."""
+    """Computes one run in a worker, which reports its progress."""
     started = time.perf_counter()
     payload = pack(run.function(run.config, run.seed, report=Reporter(tell), **run.inputs))
     return payload, time.perf_counter() - started
 
 
 def pack(result: Result) -> bytes:
-    """A result as safetensors bytes, equal for equal results; what is no array goes into the header as json.
+    """A result as safetensors bytes, equal for equal results; everything but arrays goes into the header as JSON.
 
-    Raises TypeError naming an entry that is neither an array of numbers nor json.
+    Raises TypeError naming an entry that is neither a numeric array nor JSON.
     """
     arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
     values = {name: value for name, value in result.items() if name not in arrays}
     for name, value in arrays.items():
         if value.dtype.kind not in "biuf":
-            raise TypeError(f"result {name!r}: cannot keep an array of {value.dtype}; use numbers, or a list")
+            raise TypeError(f"result {name!r}: cannot store an array of {value.dtype}; use numbers or a list")
         arrays[name] = np.asarray(value, order="C")
     try:
         header = json.dumps(values, sort_keys=True, default=_plain_number)
@@ -94,11 +94,11 @@ def pack(result: Result) -> bytes:
 def _plain_number(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"cannot keep a {type(value).__name__}; use an array, a number, text or a list")
+    raise TypeError(f"cannot store a {type(value).__name__}; use an array, a number, text or a list")
 
 
 def unpack(payload: bytes) -> Result:
-    """The result that was packed."""
+    """The result in packed bytes."""
     length = int.from_bytes(payload[:8], "little")
     header = json.loads(payload[8 : 8 + length])
     return safetensors.numpy.load(payload) | json.loads(header["__metadata__"]["values"])

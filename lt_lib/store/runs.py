@@ -1,4 +1,4 @@
-"""The run store: every training is computed once, here or on a cluster, and kept in one checked file."""
+"""The run store: every training is computed once, locally or on a cluster, and stored in one checked file."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ from lt_lib.store.sources import source_state
 
 
 class RunError(Exception):
-    """A run's function raised: the message names the run and the error, which is its cause."""
+    """A run's function raised; the message names the run and the error, which is the cause."""
 
 
 @dataclass(frozen=True)
@@ -28,19 +28,19 @@ class RunStore:
     """Finished runs in a folder, `<folder>/<function>/<key>.run`, and the workers that compute missing ones.
 
     workers: processes at a time on this machine, 0 for one per core; or a Dask scheduler's address, such as
-    tcp://127.0.0.1:8786, for the workers of its cluster. Each has one thread, so that results do not depend on it.
+    tcp://127.0.0.1:8786, for the workers of its cluster. Each has one thread, so results do not depend on the choice.
     """
 
     folder: Path
     workers: int | str = 0
 
     def fetch(self, runs: Sequence[Run], what: str) -> list[Result]:
-        """The results of `runs` in their order: finished ones are read, the others computed and kept.
+        """The results of `runs`, in order: finished ones are read, the others computed and stored.
 
         what: a few words for the progress line, e.g. 'route heads'.
 
-        Raises UserError if the folder cannot be written or the cluster not be used, RunError once all else is done
-        if any run failed.
+        Raises UserError if the folder is not writable or the cluster unusable; RunError if any run failed, after all
+        others have finished.
         """
         writable_folder(self.folder)
         keys = [run.key() for run in runs]
@@ -56,18 +56,18 @@ class RunStore:
         return self.folder / run.function.__name__ / f"{key}.run"
 
     def _read(self, key: str, run: Run) -> Result | None:
-        """A finished run's result; None if there is none, or, with a warning, if its file is damaged."""
+        """A finished run's result; None if its file is missing or, with a warning, damaged."""
         path = self._path(key, run)
         if not path.exists():
             return None
         head, _, payload = path.read_bytes().partition(b"\n")
         if head != _checksum(payload):
-            logging.getLogger(__name__).warning("%s is truncated or altered: computing %s again", path, run)
+            logging.getLogger(__name__).warning("%s is truncated or altered; recomputing %s", path, run)
             return None
         return unpack(payload)
 
     def _compute(self, missing: Mapping[str, Run], what: str) -> None:
-        """Has workers compute runs, and keeps each as soon as it is done."""
+        """Has workers compute runs and stores each as soon as it is done."""
         failures = []
         with (
             stage(self.folder, what, len(missing)) as (progress, finished),
@@ -85,7 +85,7 @@ class RunStore:
             raise RunError(f"{len(failures)} of {len(missing)} runs failed, first {run}: {reason}") from error
 
     def _start(self, missing: Mapping[str, Run], progress: Path) -> AbstractContextManager[Submit]:
-        """The workers for some runs, whose progress goes into a folder."""
+        """The workers for the missing runs; their progress goes into a folder."""
         if isinstance(self.workers, str):
             from lt_lib.store.cluster import cluster_workers  # here, since Dask takes a second to import
 
@@ -94,7 +94,7 @@ class RunStore:
         return local_workers(min(self.workers or joblib.cpu_count(), len(missing)), source, progress)
 
     def _end(self, key: str, run: Run, future: "Future[Packed]") -> BaseException | None:
-        """Keeps the result of a run that ended; what went wrong if it has none or cannot be kept."""
+        """Stores the result of a run that ended; returns the error if it has none or cannot be stored."""
         if future.cancelled():
             return ConnectionError(f"lost the scheduler at {self.workers}")
         if error := future.exception():

@@ -1,4 +1,4 @@
-"""Which of our source a function depends on, so that a kept result is used only while that source stands."""
+"""Which of our source a function depends on, so that a stored result is used only while that source is unchanged."""
 
 import ast
 import hashlib
@@ -10,10 +10,10 @@ from pathlib import Path
 
 
 def source_digest(function: Callable, *classes: type, folder: Path) -> str:
-    """sha256 of the code of a function's module, of those of `classes`, and of all of our modules imported from there.
+    """sha256 of the code of a function's module, of those of `classes`, and of all of our modules that they import.
 
-    Ours is what lies in `folder`. Comments, docstrings and layout do not count. Imports are read from the
-    source at any depth, inside functions too; a module reached only through importlib is not seen.
+    Ours are the modules in `folder`. Comments, docstrings and layout do not count. Imports are read from the source at
+    any depth, inside functions too; a module reached only through importlib is missed.
     """
     todo = {function.__module__, *(cls.__module__ for cls in classes)}
     code: dict[str, str] = {}
@@ -26,7 +26,7 @@ def source_digest(function: Callable, *classes: type, folder: Path) -> str:
 
 
 def source_state(function: Callable) -> str:
-    """Changes with any edit of the package, or of the folder, that a function is imported from."""
+    """A digest that changes with any edit of the package, or folder, that a function is imported from."""
     top = sys.modules[function.__module__.partition(".")[0]]
     found = {path: path.stat() for path in sorted(Path(top.__file__).parent.rglob("*.py"))}
     state = [(str(path), stat.st_mtime_ns, stat.st_size) for path, stat in found.items()]
@@ -34,7 +34,7 @@ def source_state(function: Callable) -> str:
 
 
 def _modules(folder: Path, name: str) -> Iterator[tuple[str, Path]]:
-    """Our modules that importing a dotted name runs, with their files."""
+    """Our modules that run when a dotted name is imported, with their files."""
     words = name.split(".")
     for count in range(1, len(words) + 1):
         stem = folder.joinpath(*words[:count])
@@ -45,7 +45,7 @@ def _modules(folder: Path, name: str) -> Iterator[tuple[str, Path]]:
 
 @lru_cache(maxsize=1000)
 def _read(path: Path, modified_ns: int, module: str) -> tuple[str, frozenset[str]]:
-    """The code of a module, and the dotted names it imports; `modified_ns` is the file's time, so that edits count."""
+    """The code of a module and the dotted names it imports; `modified_ns` makes the cache notice edits."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     imports = frozenset(_imports(body, module if path.name == "__init__.py" else module.rpartition(".")[0]))
     return "\n".join(ast.dump(_without_docstrings(node)) for node in body if not _is_text(node)), imports

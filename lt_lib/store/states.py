@@ -16,12 +16,12 @@ def state_of(module: nn.Module, prefix: str) -> dict[str, np.ndarray]:
 
 
 def restored(module: Module, result: Mapping[str, Any], prefix: str) -> Module:
-    """The module with its weights from a result; other entries do not matter."""
+    """The module with its weights from a result; other entries are ignored."""
     state = {name.removeprefix(f"{prefix}."): torch.tensor(value) for name, value in only(result, prefix).items()}
     module.load_state_dict(state)
     return module
 
 
 def only(result: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """A result's weights alone, for runs that do not depend on how the training went."""
+    """A result's weights alone, for runs that do not depend on the course of training."""
     return {name: value for name, value in result.items() if name.startswith(f"{prefix}.")}
