@@ -135,8 +135,11 @@ def test_every_row_of_the_vector_environment_is_an_environment_of_its_own_seed(m
     ended = False
     for action in np.random.default_rng(0).uniform(-1, 1, (25, 3, 3)).astype(np.float32):
         told = many.step(action)
-        fresh = [(*env.reset()[:1], 0.0, False, False, {}) if ended else env.step(a) for env, a in zip(alone, action)]
-        for got, expected in zip(told[:4], zip(*fresh), strict=False):
+        fresh = [
+            (*env.reset()[:1], 0.0, False, False, {}) if ended else env.step(a)
+            for env, a in zip(alone, action, strict=True)
+        ]
+        for got, expected in zip(told[:4], zip(*fresh, strict=True), strict=False):
             np.testing.assert_array_equal(got, np.array(expected))
         assert told[4]["slab"].tolist() == [env.unwrapped._scenes.info()["slab"] for env in alone]
         ended = told[3].all()
