@@ -21,7 +21,8 @@ def pytest_report_header() -> list[str]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Cells of notebooks are slow; tests of a release wait for `-m release`."""
+    """Cells of notebooks are slow; tests of a release wait for `-m release`; what takes longest starts first."""
+    items.sort(key=lambda item: item.path.name != "test_smoke.py")  # another worker takes the rest meanwhile
     for item in items:
         if item.path.suffix == ".ipynb":
             item.add_marker("slow")
