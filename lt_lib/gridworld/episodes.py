@@ -80,8 +80,8 @@ def play(
 ) -> Int[np.ndarray, "n t"]:
     """The navigator's cells, (n, 101); it stays where its episode ended.
 
-    What is corrupted is corrupted alike throughout an episode, as the true message of a stationary scout is: one donor,
-    one draw of the noise.
+    A corruption stays the same throughout an episode, as the true message of a stationary scout does: one donor, one
+    draw of the noise.
     """
     cell, slab, message = starts.cell, torch.from_numpy(starts.slab), torch.from_numpy(starts.post + 1)
     seed, cells = int(rng.integers(2**32)), [starts.cell]

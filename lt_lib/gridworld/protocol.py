@@ -93,7 +93,7 @@ class GridProtocol:
     def corrupted(
         self, policies: Mapping[str, list[Result]], episodes: int, encoder: Result
     ) -> dict[str, list[dict[str, Result]]]:
-        """Every frozen policy under every wire condition: {content: [{wire: result} a seed]}."""
+        """Every frozen policy under every wire condition: {content: [{wire: result} per seed]}."""
         shared = {"layout": self.grid.layout, "latency": self.grid.latency}
         runs = {
             (content, seed, wire): Run(

@@ -22,7 +22,7 @@ QUADRANTS = (
 
 
 def field_of_view(opaque: Bool[np.ndarray, "w h"], origin: tuple[int, int], radius: int) -> Bool[np.ndarray, "d d"]:
-    """The cells that can be seen from `origin` within a square of 2 * radius + 1 cells a side, centred on it.
+    """The cells that can be seen from `origin` within a square of side 2 * radius + 1 cells, centred on it.
 
     Cells outside the grid are opaque and never seen. Index [radius + dx, radius + dy].
     """

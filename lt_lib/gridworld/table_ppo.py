@@ -1,8 +1,8 @@
 """`learners.ppo.update` for a policy whose inputs are few: the same steps, summed over samples before autograd.
 
 A sample enters the loss through one entry of the table of log-probabilities and one of the table of values. The loss's
-gradient in those tables is written out below; autograd takes it from there to the parameters, once an update and not
-once a sample. A test holds the parameters after an update against `ppo.update`.
+gradient in those tables is written out below; autograd takes it from there to the parameters, once per update and
+not once per sample. A test compares the parameters after an update with those of `ppo.update`.
 """
 
 from typing import Protocol, runtime_checkable

@@ -10,7 +10,7 @@ from lt_lib.envs.layout import SIDES
 from lt_lib.gridworld.map import GOAL_REWARD, HORIZON, MOVES, SLAB_REWARD, STEP_REWARD, Grid
 from lt_lib.settings.base import LATENCY
 
-DRAWS = 4  # uniform numbers a step: action, spawn, slab, post
+DRAWS = 4  # uniform numbers per step: action, spawn, slab, post
 
 
 class States(NamedTuple):

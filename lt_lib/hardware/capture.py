@@ -37,7 +37,8 @@ def main(arguments: Sequence[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="capture", description="Takes labelled frames for notebook 08.")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--crop", type=int, required=True, help="pixels a side that subtend 32 degrees, by tape")
+    crop = "side in pixels of the square that subtends 32 degrees, by tape"
+    parser.add_argument("--crop", type=int, required=True, help=crop)
     parser.add_argument("--session", choices=WORDS["session"], required=True)
     parser.add_argument("--placement", type=int, required=True, help="a number that is new within the session")
     parser.add_argument("--distance", type=float, required=True, help="cm from the lens to the slab's front")
@@ -52,8 +53,8 @@ def _parser() -> argparse.ArgumentParser:
 def capture(options: argparse.Namespace) -> list[str]:
     """Keeps the frames as PNG and adds their rows to labels.csv; returns the files' names.
 
-    Raises UserError for a source that cannot be opened or ends too early, a frame smaller than the crop, another crop
-    than the folder states, and a placement that the session already has. Nothing is written then.
+    Raises UserError, before writing anything, for a source that cannot be opened or ends too early, a frame smaller
+    than the crop, a crop other than the folder states, and a placement that the session already has.
     """
     _check_numbers(options)
     writable_folder(options.folder)

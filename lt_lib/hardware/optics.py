@@ -13,9 +13,9 @@ from jaxtyping import Float, UInt8
 from lt_lib.settings.hardware import OpticsConfig
 
 FOV = 32.0  # degrees that the crop subtends
-CROP = 64  # pixels a side of what an encoder is given
+CROP = 64  # side in pixels of what an encoder is given
 WIDTH, HEIGHT = 160, 120  # pixels of a frame of the surrogate camera, whose central 64 x 64 are the crop
-OVERSAMPLING = 2  # rendered pixels a pixel
+OVERSAMPLING = 2  # rendered pixels per pixel, along each axis
 FOCAL = CROP / 2 / np.tan(np.deg2rad(FOV) / 2)  # pixels
 MARGIN = 1.1  # of the frame's width, rendered so that a distorted frame has no empty corner
 
@@ -93,7 +93,7 @@ def _blurred(light, shift: Float[np.ndarray, "2"]):
 
 
 def _sensed(light, optics: OpticsConfig, rng: np.random.Generator):
-    """What the sensor counts, over the full well, three colours a pixel again; (H, W, 3) in [0, 1]."""
+    """What the sensor counts, over the full well, three colours per pixel again; (H, W, 3) in [0, 1]."""
     if not optics.mosaic:
         return _counted(light, optics, rng)
     single = np.empty(light.shape[:2], np.float32)

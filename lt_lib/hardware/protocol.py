@@ -138,7 +138,7 @@ class HardwareProtocol:
         return {effect: float(strengths[effect]) for effect in effects}
 
     def after_selection(self, candidate: str, encoder: Result, seeds: int) -> tuple[Result, list[Result]]:
-        """The executor behind the selected encoder, and encoders of the cheaper size in its appearances, one a seed.
+        """The executor behind the selected encoder, and encoders of the cheaper size in its appearances, one per seed.
 
         They are computed side by side, since neither waits for the other.
         """

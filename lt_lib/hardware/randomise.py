@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from lt_lib.envs.materials import INDEX, PALETTE
 from lt_lib.hardware.recolour import paint
 
-SIZES = (6, 24)  # blotches a side of a frame, coarse and fine
+SIZES = (6, 24)  # blotches along a side of a frame, coarse and fine
 NOT_RED = 1.5  # times the larger of green and blue: no floor or wall gets as red as the slab
 SHADES = (0.55, 1.0)  # the darker of two face directions, relative to the other
 SURFACES = (("floor",), ("wall_x", "wall_y"), ("barrier_x", "barrier_y"))  # materials that share a random colour

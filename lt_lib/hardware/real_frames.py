@@ -1,7 +1,7 @@
 """Frames of a real camera (Section Hardware): a folder of pictures with their labels, checked row by row.
 
-    labels.csv   file,session,placement,distance_cm,lighting,hazard     one row a decision
-    optics.yaml  crop: 210       pixels a side of the central square that subtends 32 degrees, by tape
+    labels.csv   file,session,placement,distance_cm,lighting,hazard     one row per decision
+    optics.yaml  crop: 210       side in pixels of the central square that subtends 32 degrees, by tape
     *.png *.jpg  all of one size
 
 `session` is refit, validation or live, `placement` a whole number, `lighting` bright or dim, `hazard` 1 or 0.
@@ -49,7 +49,7 @@ def read_crop(folder: Path) -> int:
     """The stated side of the 32 degrees, pixels. Raises UserError for a folder that does not state it."""
     path = folder / OPTICS
     if not path.is_file():
-        raise UserError(f"{path} is missing; it states 'crop: <pixels a side that subtend 32 degrees>' (HARDWARE.md)")
+        raise UserError(f"{path} is missing; it states 'crop: <side in pixels that subtends 32 degrees>' (HARDWARE.md)")
     try:
         stated = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError):
@@ -61,7 +61,7 @@ def read_crop(folder: Path) -> int:
 
 
 def read_rows(folder: Path) -> list[tuple[int, dict[str, str]]]:
-    """(row number as a spreadsheet shows it, row) of every label. Raises UserError for a row that cannot be."""
+    """(row number as a spreadsheet shows it, row) of every label. Raises UserError for an invalid row."""
     path = folder / LABELS
     if not path.is_file():
         raise UserError(f"{path} is missing; it has the columns {','.join(COLUMNS)}")

@@ -41,7 +41,7 @@ EFFECTS = {
 
 
 class Session(NamedTuple):
-    """N labelled frames, one a decision."""
+    """N labelled frames, one per decision."""
 
     frames: UInt8[np.ndarray, "n 64 64 3"]  # RGB, the crop that subtends 32 degrees
     hazard: Bool[np.ndarray, " n"]
@@ -51,7 +51,7 @@ class Session(NamedTuple):
 
 
 def session_of(result: Mapping[str, np.ndarray]) -> Session:
-    """A session as a run's result holds it."""
+    """A session as stored in a run's result."""
     return Session(*(result[name] for name in Session._fields))
 
 
@@ -90,7 +90,7 @@ def with_effect(config: SessionConfig, effect: str, strength: float) -> SessionC
 
 
 def _pictures(config: SessionConfig, placements: Placements, report) -> list[UInt8[np.ndarray, "h w 3"]]:
-    """One rendered picture a placement."""
+    """One rendered picture per placement."""
     width, height = optics.rendered_size()
     scene = SurrogateScene(load_layout(config.layout), width, height, optics.FOCAL * optics.OVERSAMPLING)
     pictures = []
@@ -123,7 +123,7 @@ def _labelled(frames, placements: Placements, config: SessionConfig) -> Session:
 
 
 def simulated_session(config: SessionConfig, looks: MatchedEncoderConfig, seed: int) -> Session:
-    """The bench as the simulation shows it, one frame a placement, floor and walls as in an encoder's training."""
+    """The bench as the simulation shows it, one frame per placement, floor and walls as in an encoder's training."""
     rng = Stream.SIMULATED_BENCH.generator(seed)
     layout = load_layout(config.layout)
     placements = draw_placements(layout, config, rng)

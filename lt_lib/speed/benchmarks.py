@@ -22,7 +22,7 @@ from lt_lib.velocity.navigator import train_navigator
 
 
 def unheard(_: float) -> None:
-    """Takes a run's reports of progress, which nobody watches here."""
+    """Ignores a run's progress reports."""
 
 
 class BankCost(NamedTuple):

@@ -22,11 +22,11 @@ from lt_lib.store.run import Result
 
 
 def rates(config: GridConfig, encoder: Result, rounds: int = 2) -> pd.DataFrame:
-    """Processor seconds an update of both, the median over rounds in which they take turns, and steps a second.
+    """Processor seconds per update of both ways (the median over rounds in which they take turns) and steps per second.
 
     plain   every step encodes both robots' patches, delivers the message and asks the policy; every sample of the
-            update goes through the receiver and autograd (`learners.ppo.update`)
-    tables  what `learners.mappo.train_grid` does
+            update goes through the receiver and autograd (`ppo.update`)
+    tables  what `gridworld.mappo.train_grid` does
     """
     grid, frozen = Grid(load_layout(config.layout)), FrozenPatchEncoder(encoder)
     inputs = Inputs.of(grid, frozen, config.content)
