@@ -134,6 +134,7 @@ def test_the_readme_shows_how_to_add_each_of_the_three():
     assert all(len(diff.splitlines()) <= 30 for diff in DIFFS.values())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("git") is None, reason="git applies the README's diffs, and is not installed here")
 @pytest.mark.parametrize("what", PROOFS)
 def test_what_the_readme_adds_works(what, tmp_path):

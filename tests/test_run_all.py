@@ -19,6 +19,8 @@ from lt_lib.store.manifest import stages_since
 from lt_lib.store.progress import Progress
 from run_all import choose, clock, describe, main
 
+pytestmark = pytest.mark.slow
+
 # --- bad input
 
 
