@@ -9,7 +9,6 @@ terminal, Ctrl-C or SIGTERM.
 
 import argparse
 import contextlib
-import csv
 import hashlib
 import json
 import logging
@@ -19,7 +18,6 @@ import sys
 import threading
 import time
 import traceback
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +34,7 @@ from lt_lib.store.progress import Progress, read_progress
 
 # Without these the notebook can only fail too; the scoreboard joins whatever is there.
 NEEDS = {
+    "03_gridworld": ("02_encoder",),
     "04_pixels": ("02_encoder",),
     "05_coverage_sweep": ("02_encoder",),
     "07_corruption": ("03_gridworld", "04_pixels"),
@@ -236,7 +235,7 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
         from lt_lib.report.html import write_report  # takes seconds, which bad input need not wait for
 
         write_report(plan.outputs)
-        print_summary(plan.outputs / "scoreboard.csv")
+        print_summary(plan.outputs / "headline.md")
     return outcomes
 
 
@@ -365,11 +364,9 @@ def first_line(text: str) -> str:
     return (text.strip().splitlines() or [""])[0]
 
 
-def print_summary(scoreboard: Path) -> None:
-    """Prints the number of claims per verdict, e.g. 'scoreboard: 41 reproduced, 3 same direction'."""
-    with scoreboard.open(encoding="utf-8", newline="") as file:
-        verdicts = Counter(row["verdict"] for row in csv.DictReader(file))
-    print("scoreboard: " + ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common()))
+def print_summary(headline: Path) -> None:
+    """Prints what notebook 9 counted, e.g. 'scoreboard: Of 112 independent measured claims: 60 reproduced, ...'."""
+    print(f"scoreboard: {headline.read_text(encoding='utf-8').splitlines()[-1]}")
 
 
 if __name__ == "__main__":

@@ -284,9 +284,10 @@ def test_alternative_success_counts_blocked_incumbents_between_the_edges():
         assert (succeeded, n) == (sum(e[3] for e in kept), len(kept))
 
 
-def test_the_success_range_ignores_intervals_without_episodes():
-    assert judgements.success_range(np.array([[1, 4], [0, 0], [3, 4]])) == (0.25, 0.75)
-    assert judgements.success_range(np.zeros((2, 2), np.int64)) == (0.0, 0.0)
+def test_alternative_outcomes_are_those_episodes_and_leave_empty_intervals_out():
+    episodes = np.array([(0, 1, 0, 1), (3, 1, 0, 0), (3, 0, 0, 1), (12, 1, 0, 1)])
+    parts = judgements.alternative_outcomes({"episodes": episodes}, 1, (0, 7, 10, 14))
+    assert [part.tolist() for part in parts] == [[[True, False]], [[True]]]
 
 
 def test_the_held_command_is_sideways_travel_over_full_command():

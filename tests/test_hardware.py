@@ -348,7 +348,7 @@ def test_a_shift_spares_the_direction_and_costs_the_operating_point():
     assert both.decoded(both.simulated, "simulated").balanced > 0.95
     shifted = both.decoded(both.simulated, "live")
     assert shifted.auc > 0.95 and shifted.balanced == 0.5
-    assert both.decoded(both.refit, "live").balanced > 0.95 and both.right("live").mean() > 0.95
+    assert both.decoded(both.refit, "live").balanced > 0.95 and both.right(both.refit, "live").mean() > 0.95
 
 
 def test_frechet_distance_of_known_gaussians():
@@ -440,7 +440,7 @@ def test_a_real_folder_is_read_cropped_and_decoded_end_to_end(good_folder, train
     simulated = simulated_session(SessionConfig(hazard=100, clear=100), TINY, 9)
     both = transfer(PictureEncoder(trained), simulated, sessions)
     assert both.decoded(both.refit, "live").balanced >= 0.85
-    assert both.right("live").shape == (8,)
+    assert both.right(both.refit, "live").shape == (8,)
 
 
 def inputs(folder: Path) -> dict:

@@ -16,9 +16,9 @@ from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.pixels import episodes, redraw
 from lt_lib.pixels.episodes import Outcomes, draw_scenes, drive, roll_bank
 from lt_lib.pixels.executor import Executor, FrozenExecutor
-from lt_lib.pixels.judgements import fall_test
 from lt_lib.pixels.redraw import CREDITS, REDRAWS, Decisions, LiveArena, draws_per_episode, train_redrawn_head
 from lt_lib.pixels.route import train_head
+from lt_lib.report.judges import falls
 from lt_lib.settings.base import layout_path
 from lt_lib.settings.pixels import BankConfig, HeadConfig, RedrawConfig
 from lt_lib.settings.ppo import PpoConfig
@@ -243,10 +243,13 @@ def test_nothing_but_the_redraw_differs_from_the_heads_on_the_bank():
 
 
 def test_the_order_holds_only_if_every_step_of_it_does():
-    high, middle, low = ([0.99, 0.98, 1.0, 0.97, 0.96], [0.92, 0.9, 0.93, 0.94, 0.91], [0.7, 0.8, 0.75, 0.77, 0.72])
-    clear = fall_test([high, middle, low])
+    def seeds(*shares: float) -> np.ndarray:
+        return np.stack([np.arange(100) < round(100 * share) for share in shares])
+
+    high, middle, low = (seeds(*np.array([5, 4, 3, 2, 1]) / 100 + least) for least in (0.95, 0.89, 0.7))
+    clear = falls(high, middle, low)
     assert (clear["value"], clear["holds"], clear["p"]) == ("monotone", True, pytest.approx(1 / 252))
-    tied = fall_test([high, middle, [0.92, 0.9, 0.93, 0.94, 0.9]])
+    tied = falls(high, middle, seeds(0.94, 0.93, 0.92, 0.91, 0.89))
     assert (tied["value"], tied["holds"], tied["p"] > 0.3) == ("monotone", False, True)
-    turned = fall_test([middle, high, low])
+    turned = falls(middle, high, low)
     assert (turned["value"], turned["holds"]) == ("not monotone", False)

@@ -227,14 +227,13 @@ def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd)
 
 
 def test_a_scoreboard_is_summed_up_in_the_last_line(project, capfd):
-    rows = r"id,verdict\na,reproduced\nb,not run\nc,reproduced"
-    table = f'Path("outputs/smoke/scoreboard.csv").write_text("{rows}")'
+    table = r'Path("outputs/smoke/headline.md").write_text("| a |\n\nOf 3 claims: 2 reproduced, 1 not run.\n")'
     text = 'Path("outputs/smoke/scoreboard.md").write_text("# Scoreboard")'
     write_notebook(project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, text, WRITE)
     assert smoke(project, "--only", "09") == 0
     report = (project / "outputs" / "smoke" / "report" / "index.html").read_text()
     assert 'href="09_scoreboard.html"' in report and "profile smoke" in report
-    assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: 2 reproduced, 1 not run"
+    assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: Of 3 claims: 2 reproduced, 1 not run."
 
 
 def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(project, capfd):
@@ -244,11 +243,11 @@ def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(proje
         "07_corruption": [],
     }.items():
         write_notebook(project, name, *cells)
-    write_notebook(project, "03_gridworld", COMPUTE, "raise SystemExit(0)", WRITE)
+    write_notebook(project, "06_z_study", COMPUTE, "raise SystemExit(0)", WRITE)
     write_notebook(
         project, "08_hardware_decode", "results = [{'loss': 1}]\nimport json\nfrom pathlib import Path", WRITE
     )
-    stale = project / "outputs" / "smoke" / "results" / "03_gridworld.json"
+    stale = project / "outputs" / "smoke" / "results" / "06_z_study.json"
     stale.parent.mkdir(parents=True)
     stale.write_text("[]")
     assert smoke(project) == 1
@@ -256,7 +255,7 @@ def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(proje
     assert "FAILED" in lines["02_encoder"]
     assert lines["02_encoder"].endswith("cell 3: ValueError: the gate (log: outputs/smoke/logs/02_encoder.log)")
     assert "ValueError: the gate" in (project / "outputs" / "smoke" / "logs" / "02_encoder.log").read_text()
-    assert "ended without writing outputs/smoke/results/03_gridworld.json" in lines["03_gridworld"]
+    assert "ended without writing outputs/smoke/results/06_z_study.json" in lines["06_z_study"]
     assert "skipped" in lines["04_pixels"]
     assert lines["04_pixels"].endswith("needs 02_encoder")
     assert lines["07_corruption"].endswith("needs 03_gridworld")

@@ -10,6 +10,7 @@ from torch import nn
 from lt_lib import ppo
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.messages import CONTENTS, Sender
+from lt_lib.envs import measured
 from lt_lib.envs.arena import NO_CORRIDOR
 from lt_lib.envs.camera import FastCamera, network_input
 from lt_lib.envs.layout import load_layout
@@ -17,6 +18,9 @@ from lt_lib.gridworld.episodes import greedy, play
 from lt_lib.gridworld.map import Grid
 from lt_lib.gridworld.mappo import Actor, Inputs
 from lt_lib.gridworld.walks import first_states
+from lt_lib.hardware.matched import PictureEncoder
+from lt_lib.hardware.probe import CameraTransfer, Probe, fit_probe, transfer
+from lt_lib.hardware.sessions import Session
 from lt_lib.perception import gates, jepa, objective
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.perception.frames import Rollouts, random_rollouts
@@ -24,9 +28,12 @@ from lt_lib.pixels import redraw
 from lt_lib.pixels.episodes import Outcomes, draw_scenes
 from lt_lib.pixels.executor import Driving
 from lt_lib.pixels.route import evaluate_head, train_head
+from lt_lib.report.shares import LAST, final_episodes, final_shares
 from lt_lib.settings.perception import EncoderConfig, GateConfig
 from lt_lib.settings.pixels import EvaluationConfig, HeadConfig, RedrawConfig
+from lt_lib.settings.streams import Stream
 from lt_lib.settings.velocity import Boost, NavigatorConfig
+from lt_lib.speed.step import encoder_passes
 from lt_lib.velocity import navigator as velocity
 
 LAYOUT = load_layout("default")
@@ -283,3 +290,74 @@ def test_a_redrawn_episode_is_optimal_where_the_free_corridor_is_entered_first(w
     result = redraw.train_redrawn_head(config, 0, report=quiet, scenes=scenes, encoder=weights, executor={})
     expected = [first == 1 - slab for first, slab in zip(entered, Played.slab, strict=True)]
     assert result["optimal"].tolist() == expected and any(expected)
+
+
+# --- what results are made of
+
+
+def test_the_refit_probe_sees_the_refit_session_and_no_other():
+    rng, hazard = np.random.default_rng(0), np.arange(40) % 2 == 0
+    latents = {name: rng.normal(size=(40, 64)) + hazard[:, None] for name in ("simulated", "refit", "live")}
+    sessions = [Session(np.zeros((40, 1, 1, 3), np.uint8), hazard, *[np.zeros(40)] * 2, hazard) for _ in latents]
+
+    class Reading(PictureEncoder):
+        def __init__(self):
+            self.rows = iter(latents.values())
+
+        def latents(self, _):
+            return next(self.rows)
+
+    made = transfer(Reading(), sessions[0], dict(zip(("refit", "live"), sessions[1:], strict=True)))
+    for name, probe in (("simulated", made.simulated), ("refit", made.refit)):
+        np.testing.assert_array_equal(probe.weights, fit_probe(latents[name], hazard).weights)
+
+
+def test_the_registered_rule_keeps_the_simulated_probe_unless_it_misses_the_gate():
+    one, other = Probe(np.eye(64)[0], 0.0), Probe(np.eye(64)[1], 0.0)
+    latents = {"refit": np.random.default_rng(0).normal(size=(50, 64))}
+    for made_of, kept in ((0, one), (1, other)):  # the hazard is read off this float
+        made = CameraTransfer(one, other, latents, {"refit": latents["refit"][:, made_of] > 0})
+        assert made.registered(0.95) is kept
+
+
+def test_a_seed_ends_with_its_last_episodes_and_not_with_all():
+    seeds = [{"optimal": np.arange(1200) >= start} for start in (600, 900)]
+    np.testing.assert_allclose(final_shares(seeds, "optimal"), [1.0, 0.6])
+    assert final_episodes(seeds, "optimal").shape == (2, LAST)
+
+
+def test_conditions_and_seeds_have_streams_of_their_own():
+    draws = [
+        stream.generator(seed, *names).random()
+        for stream in (Stream.HEAD, Stream.CORRUPTION)
+        for seed in (0, 1)
+        for names in ((), ("floor", "intact"), ("position", "intact"), ("floor", "wire_zeroed"))
+    ]
+    assert len(set(draws)) == len(draws)
+
+
+def test_rows_without_a_message_meet_scenes_of_their_own(weights):
+    bank = ideal_bank(64)
+    heads = {
+        name: train_head(HeadConfig(content=name, episodes=64, batch=32, minibatch=16), 0, report=quiet, bank=bank,
+                         encoder=weights)
+        for name in ("floor", "position")
+    }  # fmt: skip
+    assert (heads["floor"]["optimal"] != heads["position"]["optimal"]).any()
+    one = heads["floor"]
+    np.testing.assert_array_equal(one["success"], one["optimal"])  # in this bank the free corridor is the way
+    assert set(np.unique(one["route"])) == {0, 1}
+
+
+def test_a_message_takes_no_further_pass_of_the_encoder(weights):
+    assert encoder_passes(LAYOUT, weights) == {"floor": 2, "latent": 2}
+
+
+def test_settings_measured_where_they_act_are_those_that_were_set():
+    for name in ("default", "matched"):
+        layout = load_layout(name)
+        assert measured.field_of_view(layout) == pytest.approx(layout.camera.fov, abs=0.05)
+    assert measured.rates(LAYOUT) == pytest.approx((10, 60))
+    assert measured.speeds(LAYOUT) == pytest.approx((0.5, 1.5))
+    wide = LAYOUT.model_copy(update={"camera": LAYOUT.camera.model_copy(update={"fov": 60.0})})
+    assert measured.field_of_view(wide) == pytest.approx(60.0, abs=0.05)

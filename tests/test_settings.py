@@ -52,7 +52,8 @@ def pixel_runs(pixels: dict, seeds: dict, layout: str) -> tuple[PixelProtocol, R
     protocol.episode_bank({}, {})
     protocol.trained_heads(seeds, {}, {})
     protocol.redrawn_heads(seeds, dict.fromkeys(SCENES, 0), {}, {})
-    protocol.corrupted("latent", {}, 7, {}, {})
+    protocol.corrupted("latent", 0, {}, 7, {}, {})
+    protocol.without_anchor(1, {}, {})
     return protocol, store
 
 

@@ -137,4 +137,10 @@ def matched_noise(wire: Float[Tensor, "b w"], rng: np.random.Generator) -> Float
     return torch.cat([wire[:, :ANCHOR], content.mean(0) + content.std(0) * noise], dim=1)
 
 
+def anchor_zeroed(wire: Float[Tensor, "b w"], rng: np.random.Generator) -> Float[Tensor, "b w"]:
+    """The content alone, which then says nothing about where its sender stands."""
+    return torch.cat([torch.zeros_like(wire[:, :ANCHOR]), wire[:, ANCHOR:]], dim=1)
+
+
 CORRUPTIONS = {f.__name__: f for f in (intact, content_zeroed, wire_zeroed, sender_shuffled, matched_noise)}
+WIRES = CORRUPTIONS | {anchor_zeroed.__name__: anchor_zeroed}  # and what a head can be trained on besides

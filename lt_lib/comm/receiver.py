@@ -11,13 +11,15 @@ class Receiver(nn.Module):
     The pooled message does not depend on the senders' order, and absent senders contribute exactly zero, even if all
     are. The value projection has no bias and starts at zero, so every condition starts as the no-message policy. With
     one sender the attention is 1 whatever the scores, so query and key get no gradient.
+
+    value_gain  of an orthogonal start of the value projection; 0 is the start at zero
     """
 
-    def __init__(self, ego: int, wire: int, pooled: int):
+    def __init__(self, ego: int, wire: int, pooled: int, value_gain: float = 0.0):
         super().__init__()
         self.query, self.key = nn.Linear(ego, pooled, bias=False), nn.Linear(wire, pooled, bias=False)
         self.value = nn.Linear(wire, pooled, bias=False)
-        nn.init.zeros_(self.value.weight)
+        nn.init.orthogonal_(self.value.weight, value_gain)
 
     def forward(
         self, ego: Float[Tensor, "b e"], wires: Float[Tensor, "b n w"], present: Bool[Tensor, "b n"]

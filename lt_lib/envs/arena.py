@@ -39,7 +39,9 @@ class Arena:
 
     def __init__(self, layout: Layout, n: int):
         self.layout = layout
-        self._batch = Batch(mujoco.MjModel.from_xml_string(physics_xml(layout)), n, nthread=1)
+        model = mujoco.MjModel.from_xml_string(physics_xml(layout))
+        self.timestep = model.opt.timestep  # seconds of simulated time per physics step
+        self._batch = Batch(model, n, nthread=1)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._mocap = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
         self._warm = self._batch.bind("qacc_warmstart")
@@ -50,6 +52,11 @@ class Arena:
     @property
     def n(self) -> int:
         return len(self._qpos)
+
+    @property
+    def time(self) -> Float[np.ndarray, " n"]:
+        """Seconds of simulated time."""
+        return np.array(self._batch.bind("time")).reshape(-1)
 
     @property
     def pose(self) -> Float[np.ndarray, "n 3"]:

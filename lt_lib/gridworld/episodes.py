@@ -11,7 +11,7 @@ from lt_lib.comm.channel import CORRUPTIONS, Channel
 from lt_lib.envs.layout import load_layout
 from lt_lib.gridworld.map import HORIZON, Grid
 from lt_lib.gridworld.mappo import Actor, Inputs
-from lt_lib.gridworld.patches import FrozenPatchEncoder
+from lt_lib.gridworld.views import VIEWS
 from lt_lib.gridworld.walks import States, first_states
 from lt_lib.settings.base import LATENCY
 from lt_lib.settings.gridworld import GridEvaluationConfig
@@ -49,10 +49,10 @@ def evaluate_grid(
     navigator, padded with the last; "slab" (n,) is the blocked corridor.
     """
     grid = Grid(load_layout(config.layout))
-    inputs = Inputs.of(grid, FrozenPatchEncoder(encoder), config.content)
+    inputs = Inputs.of(grid, VIEWS["cells"](grid, encoder), config.content)
     actor, result = read_actor(policy), {}
     for name, choose in CHOICES.items():
-        rng = Stream.GRID_EVALUATION.generator(seed)
+        rng = Stream.GRID_EVALUATION.generator(seed, config.content)
         starts = first_states(grid, config.episodes, rng)
         cells = play(grid, inputs, actor, starts, config.wire, choose, rng, config.latency)
         arrived = grid.goal[cells]

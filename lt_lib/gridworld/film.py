@@ -15,7 +15,7 @@ from lt_lib.gridworld.board import board, patch
 from lt_lib.gridworld.episodes import read_actor
 from lt_lib.gridworld.map import Grid
 from lt_lib.gridworld.mappo import Actor, Inputs
-from lt_lib.gridworld.patches import FrozenPatchEncoder
+from lt_lib.gridworld.views import cells
 from lt_lib.report.scene import NAVIGATOR, SCOUT
 from lt_lib.report.style import ROLES
 from lt_lib.store.run import Result
@@ -26,7 +26,7 @@ ARROWS = ("stay", "right", "left", "up", "down")
 
 def film(grid: Grid, policy: Result, encoder: Result, content: str, start: int, slab: int, path: Path) -> Path:
     """Films a greedy episode from a spawn cell with the slab in one corridor; one picture per step."""
-    inputs, actor = Inputs.of(grid, FrozenPatchEncoder(encoder), content), read_actor(policy)
+    inputs, actor = Inputs.of(grid, cells(grid, encoder), content), read_actor(policy)
     cell, pictures = start, []
     for step in range(LONGEST):
         message = 0 if step == 0 else 1 + len(grid.posts) // 2

@@ -1,77 +1,108 @@
-"""The verdicts of the gridworld under corruption: policies that fall, that peek, and that must not change."""
+"""The verdicts of the gridworld under corruption: policies that fall, that peek, and that must not change.
+
+Samples are arrays (policies, episodes), one per wire of CORRUPTIONS, intact first.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from jaxtyping import Bool, Float
+
 from lt_lib.comm.channel import CORRUPTIONS
-from lt_lib.report import stats
-from lt_lib.report.shares import SOLVED, final_shares
+from lt_lib.report import judges, stats
+from lt_lib.report.stats import ALPHA
 from lt_lib.store.run import Result
 
-Policies = Mapping[str, Sequence[Result]]
-Played = Mapping[str, Sequence[Mapping[str, Result]]]
-DESTROYED = tuple(wire for wire in CORRUPTIONS if wire != "intact")
+Played = Sequence[Mapping[str, Result]]
+Sample = Float[np.ndarray, "_policies _episodes"]
 COUNTED = ("latent", "predicted", "raw")  # the paper's twelve: solved policies of these contents
+SAME_WIRE = {"floor": ("content_zeroed", "sender_shuffled", "matched_noise")}  # these leave an empty content as it is
 RETURNED = 0.6  # success of a policy that corruption has returned to chance, at most
 REROUTES = 0.1  # share of episodes in both corridors from which a policy reroutes
-CONTROL_ALPHA = 0.01  # of the negative control, over all its cells
+UNCHANGED = 0.1  # success by which a negative control may differ, as judges.AT_CHANCE
 
 
-def judge_corrupted(policies: Policies, played: Played) -> dict[str, dict[str, Any]]:
-    """The findings: solved policies that fall to chance, those that peek, and unsolved ones that must not change.
+def sampled(played: Played, what: str) -> list[Sample]:
+    """'success', 'length' or 'rerouted' of every policy, its actions sampled, one array per wire."""
+    return [np.array([row[wire][f"sampled.{what}"] for row in played], dtype=float) for wire in CORRUPTIONS]
 
-    policies  results of `train_grid` by content
-    played    what `GridProtocol.corrupted` makes of them
 
-    If no policy solves the task, as at smoke size, the first finding is missing.
+def kept_rows(played: Mapping[str, Played], flags: Mapping[str, Bool[np.ndarray, " policies"]]) -> dict[str, Played]:
+    """The rows of `played` that the flags keep, content by content."""
+    return {name: [row for row, keep in zip(rows, flags[name], strict=True) if keep] for name, rows in played.items()}
+
+
+def returned(intact: Sample, *destroyed: Sample) -> dict[str, Any]:
+    """How many solved policies fall to chance under every destroyed wire; holds if that is most of them."""
+    best = np.max([each.mean(axis=1) for each in destroyed], axis=0)  # (policies,)
+    fallen = int((best <= RETURNED).sum())
+    low, _ = stats.wilson(fallen, len(best))
+    return {
+        "value": f"{fallen} of {len(best)}",
+        "n": len(best),
+        "test": f"success at most {RETURNED} under every destroyed wire; 95% interval of the share above 0.5",
+        "holds": low > 0.5,
+        "note": f"the best of them under any destroyed wire has {best.max():.2f}, intact {intact.mean():.2f}",
+    }
+
+
+def peeks(rerouted: Sample, *destroyed: Sample) -> Bool[np.ndarray, " policies"]:
+    """Which policies keep their success under every destroyed wire, and enter both corridors with the wire intact."""
+    least = np.min([each.mean(axis=1) for each in destroyed], axis=0)  # (policies,)
+    return (least > RETURNED) & (rerouted.mean(axis=1) >= REROUTES)
+
+
+def peeking(rerouted: Sample, *destroyed: Sample) -> dict[str, Any]:
+    """How many solved policies peek; holds if any does."""
+    found = int(peeks(rerouted, *destroyed).sum())
+    return {
+        "value": found,
+        "n": len(rerouted),
+        "test": "keeps its success without the message, and enters both corridors",
+        "holds": found > 0,
+        "note": f"with the wire intact no solved policy reroutes in more than {rerouted.mean(axis=1).max():.2f} of its "
+        "episodes",
+    }
+
+
+def longer_episodes(peekers: Sample, others: Sample) -> dict[str, Any]:
+    """Whether policies that peek are visible in their episode length, beside solved ones that do not."""
+    if not len(peekers):
+        return judges.words(False, "no solved policy peeks, so none can be seen", n=max(1, len(others)))
+    p = stats.rank_test(peekers.mean(axis=1), others.mean(axis=1))
+    return judges.words(p < ALPHA, "exact rank test of mean episode lengths", p=p, n=len(peekers))
+
+
+def changes(failed: Mapping[str, Played]) -> list[Sample]:
+    """What a destroyed wire changes in the success of never-solved policies, episode by episode: -1, 0 or 1.
+
+    One array per content and wire, without the wires that leave a content as it is.
     """
-    pairs = [
-        (name, row, share >= SOLVED)
-        for name, rows in played.items()
-        for row, share in zip(rows, final_shares(policies[name], "success"), strict=True)
+    return [
+        after - before
+        for name, rows in failed.items()
+        if rows
+        for before, *rest in [sampled(rows, "success")]
+        for wire, after in zip(list(CORRUPTIONS)[1:], rest, strict=True)
+        if wire not in SAME_WIRE.get(name, ())
     ]
-    counted = [row for name, row, solved in pairs if solved and name in COUNTED]
-    unsolved = [row for _, row, solved in pairs if not solved]
-    fallen = [row for row in counted if _best(row) <= RETURNED]
-    peeking = [row for row in counted if _best(row) > RETURNED and _reroutes(row) >= REROUTES]
-    worst = max((_best(row) for row in counted), default=0.0)
-    rerouting = max(map(_reroutes, counted), default=0.0)
-    p = min((_changed(row, wire) for row in unsolved for wire in DESTROYED), default=1.0)
-    cells = max(1, len(unsolved) * len(DESTROYED))
-    unchanged = p > CONTROL_ALPHA / cells
-    corrupt = {
-        "value": f"{len(fallen)} of {len(counted)}",
-        "test": f"success at most {RETURNED} under every destroyed wire",
-        "holds": len(fallen) >= 0.75 * len(counted),
-        "note": f"the best of them under any destroyed wire has {worst:.2f}",
+
+
+def unchanged(*changed: Sample) -> dict[str, Any]:
+    """Whether never-solved policies keep their success under every destroyed wire, by paired episodes.
+
+    Every content and wire must be equivalent to the intact wire within UNCHANGED (TOST, seeds as units); p is the
+    largest. The least McNemar p of a single policy stands in the note.
+    """
+    p = max(stats.equivalence(each, 0.0, UNCHANGED) for each in changed)
+    single = [stats.sign_test(int((row > 0).sum()), int((row < 0).sum())) for each in changed for row in each]
+    return {
+        "value": "all" if p < ALPHA else "not all",
+        "n": len(single),
+        "test": f"equivalence of paired episodes ± {UNCHANGED} (TOST), every content and wire; the largest p",
+        "p": p,
+        "holds": p < ALPHA,
+        "note": f"least McNemar p of {len(single)} policies and wires {min(single):.2g}; Bonferroni asks for "
+        f"{ALPHA / len(single):.2g}",
     }
-    return ({"grid.corrupt": corrupt} if counted else {}) | {
-        "grid.peek": {
-            "value": len(peeking),
-            "test": "keeps its success without the message, and enters both corridors",
-            "holds": bool(peeking),
-            "note": f"with the wire intact no solved policy reroutes in more than {rerouting:.2f} of its episodes",
-        },
-        "grid.invariant": {
-            "value": "all" if unchanged else "not all",
-            "n": max(1, len(unsolved)),
-            "test": f"two-sided Fisher exact tests of {cells} cells, Bonferroni at {CONTROL_ALPHA}",
-            "p": p,
-            "holds": unchanged,
-            "note": f"least p of {cells} cells: {p:.2f}",
-        },
-    }
-
-
-def _best(row: Mapping[str, Result]) -> float:
-    return max(row[wire]["sampled.success"].mean() for wire in DESTROYED)
-
-
-def _reroutes(row: Mapping[str, Result]) -> float:
-    return row["intact"]["sampled.rerouted"].mean()
-
-
-def _changed(row: Mapping[str, Result], wire: str) -> float:
-    """Two-sided Fisher exact p that a policy succeeds as often with the wire destroyed as intact."""
-    counts = [(row[name]["sampled.success"].sum(), row[name]["sampled.success"].size) for name in ("intact", wire)]
-    return stats.same_share(*counts)

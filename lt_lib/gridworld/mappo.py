@@ -20,8 +20,8 @@ from lt_lib.comm.channel import heard
 from lt_lib.comm.receiver import Receiver
 from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.gridworld import table_ppo
-from lt_lib.gridworld.map import MOVES, PATCH, Grid
-from lt_lib.gridworld.patches import FrozenPatchEncoder
+from lt_lib.gridworld.map import MOVES, Grid
+from lt_lib.gridworld.views import VIEWS, Views
 from lt_lib.gridworld.walks import Walks, first_states, walk
 from lt_lib.gridworld.wires import anchors, contents_sent
 from lt_lib.perception.encoder import LATENT
@@ -36,10 +36,10 @@ WIDTH = 64  # of every hidden layer
 class Actor(nn.Module):
     """The robot's own latent and the messages it has received to the logits of five actions."""
 
-    def __init__(self, wire: int):
+    def __init__(self, wire: int, value_gain: float = 0.0):
         super().__init__()
         self.embed = nn.Sequential(nn.Linear(LATENT, WIDTH), nn.Tanh())
-        self.receiver = Receiver(WIDTH, wire, WIDTH)
+        self.receiver = Receiver(WIDTH, wire, WIDTH, value_gain)
         self.hidden = nn.Sequential(nn.Linear(2 * WIDTH, WIDTH), nn.Tanh())
         self.logits = nn.Linear(WIDTH, len(MOVES))
         nn.init.zeros_(self.logits.weight)
@@ -77,9 +77,10 @@ class Inputs(NamedTuple):
     present: Bool[Tensor, "m p"]
 
     @classmethod
-    def of(cls, grid: Grid, encoder: FrozenPatchEncoder, content: str) -> "Inputs":
-        own = encoder.latent(grid.patches.reshape(-1, PATCH, PATCH)).reshape(len(grid.cells), len(SIDES), LATENT)
-        where, sent = anchors(grid), contents_sent(grid, encoder, content)
+    def of(cls, grid: Grid, views: Views, content: str) -> "Inputs":
+        seen = views.own.reshape(-1, *views.own.shape[2:])  # (p * slab, h, w)
+        own = views.encoder.latent(seen).reshape(len(grid.cells), len(SIDES), LATENT)
+        where, sent = anchors(grid), contents_sent(grid, views, content)
         return cls(own, *(torch.cat([torch.zeros_like(x[:1]), x]) for x in (where, sent, heard(where))))
 
     def wires(self, observations: Int[Tensor, "b 3"]) -> Float[Tensor, "b w"]:
@@ -90,11 +91,11 @@ class Inputs(NamedTuple):
 class Team(nn.Module):
     """Actor and critic as PPO's policy; observations (B, 3) are rows of (message, cell, slab)."""
 
-    def __init__(self, inputs: Inputs):
+    def __init__(self, inputs: Inputs, value_gain: float = 0.0):
         super().__init__()
         self.inputs = inputs
         states, width = inputs.own.shape[0] * len(SIDES), inputs.anchors.shape[-1] + inputs.contents.shape[-1]
-        self.actor, self.critic = Actor(width), Critic(states)
+        self.actor, self.critic = Actor(width, value_gain), Critic(states)
 
     def logits(self, observations: Int[Tensor, "b 3"]) -> Float[Tensor, "b 5"]:
         message, cell, slab = observations.unbind(1)
@@ -142,11 +143,11 @@ def train_grid(
     "ended"                     (updates,) episodes that had ended after each update's rollout
     "entropy", "value_loss"     (updates,) nats, squared reward
     """
-    grid, rng = Grid(load_layout(config.layout)), Stream.GRID_POLICY.generator(seed)
-    inputs = Inputs.of(grid, FrozenPatchEncoder(encoder), config.content)
+    grid, rng = Grid(load_layout(config.layout)), Stream.GRID_POLICY.generator(seed, config.content, config.view)
+    inputs = Inputs.of(grid, VIEWS[config.view](grid, encoder), config.content)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        team = TableTeam(inputs)
+        torch.manual_seed(int(rng.integers(2**31)))
+        team = TableTeam(inputs, config.value_gain)
     optimiser = torch.optim.Adam(team.parameters(), lr=config.lr, eps=1e-5, fused=True)
     states, updates, success, length, ended = first_states(grid, config.envs, rng), [], [], [], []
     total = -(-config.steps // (config.envs * config.rollout))

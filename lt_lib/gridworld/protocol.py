@@ -81,6 +81,20 @@ class GridProtocol:
         """Stage 2 for the latent of each of several encoders."""
         return self._fetch({name: ("latent", seeds, encoder) for name, encoder in encoders.items()})
 
+    def variants(
+        self, changes: Mapping[str, Mapping[str, object]], encoder: Result, seeds: int
+    ) -> dict[str, list[Result]]:
+        """Stage 2 with settings that the paper's rows share changed: so many seeds of each, by name."""
+        runs = {
+            (name, seed): Run(
+                train_grid, self.grid.model_copy(update=dict(change)), seed, {"encoder": _frozen(encoder)}
+            )
+            for name, change in changes.items()
+            for seed in range(seeds)
+        }
+        results = dict(zip(runs, self.store.fetch(list(runs.values()), "gridworld variants"), strict=True))
+        return {name: [results[name, seed] for seed in range(seeds)] for name in changes}
+
     def _fetch(self, wanted: Mapping[str, tuple[str, int, Result]]) -> dict[str, list[Result]]:
         runs = {
             (name, seed): Run(train_grid, self._trained_on(content), seed, {"encoder": _frozen(encoder)})
@@ -99,7 +113,7 @@ class GridProtocol:
             (content, seed, wire): Run(
                 evaluate_grid,
                 GridEvaluationConfig(content=content, wire=wire, episodes=episodes, **shared),
-                SEED,
+                seed,
                 {"policy": only(policy, "actor"), "encoder": _frozen(encoder)},
             )
             for content, trained in policies.items()

@@ -9,7 +9,7 @@ from lt_lib.comm.channel import anchor
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.envs.layout import SIDES
 from lt_lib.gridworld.map import CODES, Grid
-from lt_lib.gridworld.patches import FrozenPatchEncoder
+from lt_lib.gridworld.views import Views
 from lt_lib.settings.base import require_known
 
 
@@ -21,13 +21,13 @@ def raw(sender: Sender) -> Float[Tensor, "b 225"]:
 GRID_CONTENTS = CONTENTS | {"raw": raw}
 
 
-def contents_sent(grid: Grid, encoder: FrozenPatchEncoder, content: str) -> Float[Tensor, "m slab c"]:
+def contents_sent(grid: Grid, views: Views, content: str) -> Float[Tensor, "m slab c"]:
     """What a scout at each of its m posts sends under either placement. Raises UserError for an unknown content."""
     require_known([content], GRID_CONTENTS, "message content")
     post, slab = (values.ravel() for values in np.indices((len(grid.posts), len(SIDES))))
     pose = np.pad(grid.centres[grid.posts[post]], ((0, 0), (0, 1)))  # a scout on cells has no heading
     still = np.zeros((len(post), 2))
-    sender = Sender(grid.layout, encoder, grid.patches[grid.posts[post], slab], pose, still, slab)
+    sender = Sender(grid.layout, views.encoder, views.posts[post, slab], pose, still, slab)
     return GRID_CONTENTS[content](sender).reshape(len(grid.posts), len(SIDES), -1)
 
 

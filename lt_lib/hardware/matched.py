@@ -14,7 +14,8 @@ from sklearn.metrics import balanced_accuracy_score
 from torch import Tensor
 
 from lt_lib.envs.layout import load_layout
-from lt_lib.hardware.randomise import Appearances, draw_appearances, eight_bits, recoloured
+from lt_lib.envs.materials import INDEX
+from lt_lib.hardware.randomise import SURFACES, Appearances, draw_appearances, eight_bits, recoloured
 from lt_lib.perception.encoder import LATENT, Encoder, Frozen, in_chunks
 from lt_lib.perception.frames import Rollouts, hazard_visible, random_rollouts, wall_pixels
 from lt_lib.perception.gates import PROBE_SHARE, effective_rank
@@ -90,6 +91,7 @@ class Shown(NamedTuple):
     hazard: float  # balanced accuracy of the linear hazard-visible probe
     walls: float  # R^2 of the linear wall-count probe
     rank: float  # effective rank, by singular values
+    appearance: float  # R^2 of a linear probe of the colours of floor, walls and barrier
 
 
 def measure_matched_gates(
@@ -106,14 +108,18 @@ def measure_matched_gates(
         latents[:, t] = network.latents(eight_bits(recoloured(rollouts.frames[:, t], looks)))
         report((t + 1) / config.length)
     visible, walls = hazard_visible(rollouts.frames), wall_pixels(rollouts.frames)
+    own = looks.palettes[:, [INDEX[names[0]] for names in SURFACES]].reshape(len(latents), 1, -1)
+    colours = np.repeat(own, config.length, axis=1)  # (rollouts, length, 9)
     cut = int(len(latents) * PROBE_SHARE)
     train, test = latents[:cut].reshape(-1, LATENT), latents[cut:].reshape(-1, LATENT)
     probe = LogisticRegression(class_weight="balanced", max_iter=2000).fit(train, visible[:cut].ravel())
     wall_probe = LinearRegression().fit(train, walls[:cut].ravel())
+    colour_probe = LinearRegression().fit(train, colours[:cut].reshape(len(train), -1))
     return Shown(
         float(balanced_accuracy_score(visible[cut:].ravel(), probe.predict(test))),
         float(wall_probe.score(test, walls[cut:].ravel())),
         effective_rank(latents.reshape(-1, LATENT)),
+        float(colour_probe.score(test, colours[cut:].reshape(len(test), -1))),
     )._asdict()
 
 

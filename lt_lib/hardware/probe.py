@@ -43,7 +43,7 @@ def decoded(scores: Float[np.ndarray, " n"], hazard: Bool[np.ndarray, " n"]) -> 
     return Decoded(float(roc_auc_score(hazard, scores)), float(balanced_accuracy_score(hazard, scores > 0)))
 
 
-class Transfer(NamedTuple):
+class CameraTransfer(NamedTuple):
     """One encoder's way from simulation to the camera."""
 
     simulated: Probe  # fitted on simulated latents
@@ -54,18 +54,22 @@ class Transfer(NamedTuple):
     def decoded(self, probe: Probe, session: str) -> Decoded:
         return decoded(probe.scores(self.latents[session]), self.hazard[session])
 
-    def right(self, session: str) -> Bool[np.ndarray, " n"]:
-        """Which decisions the refit probe gets right."""
-        return (self.refit.scores(self.latents[session]) > 0) == self.hazard[session]
+    def registered(self, gate: float) -> Probe:
+        """The probe that the registered rule keeps: the simulated one unless it misses the gate when refit."""
+        return self.simulated if self.decoded(self.simulated, "refit").balanced >= gate else self.refit
+
+    def right(self, probe: Probe, session: str) -> Bool[np.ndarray, " n"]:
+        """Which decisions a probe gets right."""
+        return (probe.scores(self.latents[session]) > 0) == self.hazard[session]
 
 
-def transfer(encoder: PictureEncoder, simulated: Session, sessions: Mapping[str, Session]) -> Transfer:
+def transfer(encoder: PictureEncoder, simulated: Session, sessions: Mapping[str, Session]) -> CameraTransfer:
     """Fits both probes of an encoder; the validation and live sessions are encoded and nothing more."""
     everything = {"simulated": simulated, **sessions}
     latents = {name: encoder.latents(session.frames) for name, session in everything.items()}
     hazard = {name: session.hazard for name, session in everything.items()}
     probes = (fit_probe(latents[name], hazard[name]) for name in ("simulated", "refit"))
-    return Transfer(*probes, latents, hazard)
+    return CameraTransfer(*probes, latents, hazard)
 
 
 def placements_right(right: Bool[np.ndarray, " n"], placement) -> tuple[int, int]:

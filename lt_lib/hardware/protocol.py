@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from lt_lib.envs.layout import load_layout
 from lt_lib.hardware.matched import PictureEncoder, measure_matched_gates, train_matched_encoder
-from lt_lib.hardware.probe import Transfer, transfer
+from lt_lib.hardware.probe import CameraTransfer, transfer
 from lt_lib.hardware.real_frames import read_sessions
 from lt_lib.hardware.sessions import Session, film_session, film_sweep, session_of, simulated_session
 from lt_lib.perception.encoder import FrozenEncoder
@@ -118,7 +118,7 @@ class HardwareProtocol:
 
     def transfers(
         self, encoders: Mapping[str, Result], looks: str, sessions: Mapping[str, Session]
-    ) -> dict[str, Transfer]:
+    ) -> dict[str, CameraTransfer]:
         """Both probes of each encoder; all of them were trained in the appearances of the candidate `looks`."""
         simulated = self.simulated_bench(looks)
         return {

@@ -1,12 +1,11 @@
-"""Fits of the share of solved runs against z: one sigmoid, one per window length, and their comparison.
+"""Fits of the share of solved runs against z: one sigmoid, one for each window length, and their comparison.
 
-The setting is the unit: its seeds share d, N and sigma, so the bootstrap resamples whole settings and the model
-comparison allows the counts of a setting more scatter than a binomial.
+The settings are a fixed design and the seeds of each are independent draws, so intervals resample seeds.
 
 z (S,) of the settings, solved (S,) counts out of n seeds each, group (S,) index of the window length.
 """
 
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,25 +14,65 @@ from scipy import stats
 from scipy.optimize import minimize
 from scipy.special import expit, log_expit
 
-WIDTHS = (0.02, 20.0)  # of the sigmoid; without a lower bound no fit exists if one z separates the outcomes
-ALIKE = (1e-6, 0.99)  # correlation between seeds of one setting
+STEPS = 50  # widths on the grid
+WIDTHS = (0.02, 20.0)  # of the sigmoid; without a lower bound it has no fit where one z separates the outcomes
 Z, Counts = Float[np.ndarray, " s"], Int[np.ndarray, " s"]
 
 
 def fit(z: Z, solved: Counts, n: int) -> tuple[float, float]:
-    """Maximum-likelihood centre and width of the sigmoid, seeds binomial."""
+    """Centre and width of the likeliest sigmoid, seeds binomial."""
     centre, log_width = _likeliest(partial(_binomial, z, np.zeros(len(z), int), solved, n), z, 1).x
     return float(centre), float(np.exp(log_width))
 
 
+@lru_cache(maxsize=8)
+def _grid(z: bytes) -> tuple[Float[np.ndarray, "c w 2"], Float[np.ndarray, "c w s"], Float[np.ndarray, "c w s"]]:
+    """Sigmoids (centres 0.05 apart), and per setting the log-probability of a solved and of an unsolved run.
+
+    Every resample of a design asks for the same ones.
+    """
+    settings = np.frombuffer(z)
+    centres, widths = np.arange(settings.min(), settings.max() + 0.05, 0.05), np.geomspace(*WIDTHS, STEPS)
+    grid = np.stack(np.meshgrid(centres, widths, indexing="ij"), -1)
+    logit = (grid[..., :1] - settings) / grid[..., 1:]
+    return grid, log_expit(logit), log_expit(-logit)
+
+
+def likelihoods(
+    z: Z, solved: Int[np.ndarray, "s ..."], n: int | Int[np.ndarray, " s"]
+) -> tuple[Float[np.ndarray, "c w 2"], Float[np.ndarray, "c w ..."]]:
+    """Sigmoids on a grid of centres and widths, and the log-likelihood of each, seeds binomial."""
+    grid, yes, no = _grid(np.ascontiguousarray(z, float).tobytes())
+    return grid, yes @ solved + no @ (n - solved)
+
+
 def bootstrap(z: Z, solved: Counts, n: int, repeats: int, rng: np.random.Generator) -> Float[np.ndarray, "b 2"]:
-    """Centre and width over resampled settings, each by maximum likelihood on a grid (centres 0.05 apart)."""
-    centres, widths = np.arange(z.min(), z.max() + 0.05, 0.05), np.geomspace(*WIDTHS, 50)
-    grid = np.stack(np.meshgrid(centres, widths, indexing="ij"), -1).reshape(-1, 2)
-    logit = (grid[:, :1] - z) / grid[:, 1:]
-    by_setting = solved * log_expit(logit) + (n - solved) * log_expit(-logit)  # (sigmoids, S)
-    often = rng.multinomial(len(z), np.full(len(z), 1 / len(z)), repeats)  # how often each setting is drawn
-    return grid[[np.argmax(by_setting @ times) for times in often]]
+    """Centre and width over resampled seeds, each the likeliest on a grid of sigmoids.
+
+    The settings are a design, not a sample, so each keeps its place and its seeds are drawn anew (binomial).
+    """
+    drawn = rng.binomial(n, solved / n, (repeats, len(z)))  # (b, s)
+    grid, loglik = likelihoods(z, drawn.T, n)  # (c, w, 2), (c, w, b)
+    return grid.reshape(-1, 2)[loglik.reshape(-1, repeats).argmax(axis=0)]
+
+
+def centre_profile(z: Z, solved: Counts, n: int) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    """Centres on a grid, and how far the log-likelihood of the best sigmoid there lies below the best of all."""
+    grid, loglik = likelihoods(z, solved, n)
+    return grid[:, 0, 0], loglik.max() - loglik.max(axis=1)
+
+
+def wider(z: Z, solved: Counts, other: Counts, n: int) -> tuple[float, float, float]:
+    """The widths of two sigmoids over the same settings, and the one-sided p that the first is the wider.
+
+    The likelihood ratio compares two widths with one for both, the centres free.
+    """
+    grid, _ = likelihoods(z, solved, n)
+    profiles = [likelihoods(z, counts, n)[1].max(axis=0) for counts in (solved, other)]  # (w,) each
+    widths = [float(grid[0, each.argmax(), 1]) for each in profiles]
+    ratio = 2 * (sum(each.max() for each in profiles) - sum(profiles).max())
+    p = float(stats.chi2.sf(ratio, 1) / 2)
+    return *widths, p if widths[0] > widths[1] else 1 - p
 
 
 def explained(z: Z, solved: Counts, n: int, centre: float, width: float) -> float:
@@ -43,36 +82,33 @@ def explained(z: Z, solved: Counts, n: int, centre: float, width: float) -> floa
 
 
 class Comparison(NamedTuple):
-    """One sigmoid for all against one centre per window length (common width)."""
+    """One sigmoid for all against one centre for each window length (a common width)."""
 
     centres: Float[np.ndarray, " g"]
-    statistic: float  # twice the difference of log-likelihoods, seeds of a setting correlated (beta-binomial)
-    p: float
-    naive_p: float  # the same with all seeds independent (binomial)
-    alike: float  # correlation between seeds of a setting under one curve
+    p: float  # of the likelihood ratio, seeds independent
 
 
 def compare(z: Z, group: Int[np.ndarray, " s"], solved: Counts, n: int) -> Comparison:
-    """Likelihood-ratio test of whether the window length adds anything to a logistic model in z."""
-    groups, together = int(group.max()) + 1, np.zeros(len(z), int)
-    naive = [_likeliest(partial(_binomial, z, g, solved, n), z, int(g.max()) + 1) for g in (together, group)]
-    clustered = [
-        _likeliest(partial(_beta_binomial, z, g, solved, n), z, int(g.max()) + 1, start)
-        for g, start in zip((together, group), naive, strict=True)
-    ]
-    ratios = [2 * (one.fun - each.fun) for one, each in (naive, clustered)]
-    naive_p, p = (float(stats.chi2.sf(max(ratio, 0.0), groups - 1)) for ratio in ratios)
-    return Comparison(clustered[1].x[:groups], float(ratios[1]), p, naive_p, float(clustered[0].x[-1]))
+    """Likelihood-ratio test that the window length adds nothing to a logistic model that has z.
+
+    Given d, N and sigma the seeds of a setting are independent, so their counts are binomial: whatever scatter is left
+    is a lack of fit of z, which the test must not absorb.
+    """
+    grid, loglik = likelihoods(z, solved, n)
+    groups = int(group.max()) + 1
+    masked = [np.where(group == g, solved, 0) for g in range(groups)]
+    sizes = [np.where(group == g, n, 0) for g in range(groups)]
+    each = [likelihoods(z, counts, size)[1] for counts, size in zip(masked, sizes, strict=True)]  # (c, w) per group
+    width = int(sum(part.max(axis=0) for part in each).argmax())
+    ratio = 2 * (sum(part[:, width].max() for part in each) - loglik.max())
+    centres = np.array([grid[part[:, width].argmax(), width, 0] for part in each])
+    return Comparison(centres, float(stats.chi2.sf(max(ratio, 0.0), groups - 1)))
 
 
-def _likeliest(loss, z: Z, groups: int, start=None):
-    """Minimises a negative log-likelihood over centres, log width and, given a start without it, correlation."""
+def _likeliest(loss, z: Z, groups: int):
+    """The minimum of a negative log-likelihood over centres and log width."""
     bounds = [(z.min(), z.max())] * groups + [tuple(np.log(WIDTHS))]
-    if start is None:
-        starts = [np.array([centre] * groups + [0.0]) for centre in np.quantile(z, (0.2, 0.4, 0.6))]
-    else:
-        bounds += [ALIKE]
-        starts = [np.append(start.x, alike) for alike in (0.001, 0.1, 0.4)]
+    starts = [np.array([centre] * groups + [0.0]) for centre in np.quantile(z, (0.2, 0.4, 0.6))]
     tries = [minimize(loss, x, method="L-BFGS-B", bounds=bounds) for x in starts]
     return min(tries, key=lambda tried: tried.fun)
 
@@ -80,9 +116,3 @@ def _likeliest(loss, z: Z, groups: int, start=None):
 def _binomial(z: Z, group, solved: Counts, n: int, x: Float[np.ndarray, " k"]) -> float:
     logit = (x[group] - z) / np.exp(x[-1])
     return float(-np.sum(solved * log_expit(logit) + (n - solved) * log_expit(-logit)))
-
-
-def _beta_binomial(z: Z, group, solved: Counts, n: int, x: Float[np.ndarray, " k"]) -> float:
-    share = np.clip(expit((x[group] - z) / np.exp(x[-2])), 1e-9, 1 - 1e-9)
-    spread = (1 - x[-1]) / x[-1]
-    return float(-stats.betabinom.logpmf(solved, n, share * spread, (1 - share) * spread).sum())

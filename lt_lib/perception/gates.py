@@ -22,6 +22,7 @@ from lt_lib.settings.perception import GateConfig, Gates
 from lt_lib.settings.streams import Stream
 
 PROBE_SHARE = 0.7  # of the held-out rollouts train the probes; the rest test them
+SAMPLED = 4  # latents per rollout that are kept with the measurement
 
 
 class GateError(UserError):
@@ -41,11 +42,14 @@ class Measured(NamedTuple):
 
 
 def effective_rank(latent: Float[np.ndarray, "b d"], power: int = 1) -> float:
-    """Exponential of the entropy of the centred latents' normalised spectrum.
+    """Exponential of the entropy of the centred latents' normalised spectrum; 0 for latents that are all equal.
 
     power  1: singular values; 2: eigenvalues of the covariance
     """
-    spectrum = np.linalg.svd(latent - latent.mean(axis=0), compute_uv=False) ** power  # (d,)
+    centred = latent.astype(np.float64) - latent.mean(axis=0)
+    spectrum = np.linalg.svd(centred, compute_uv=False) ** power  # (d,)
+    if not spectrum.sum() > np.finfo(float).tiny:
+        return 0.0
     share = spectrum / spectrum.sum()
     return float(np.exp(-(share * np.log(np.maximum(share, 1e-300))).sum()))
 
@@ -60,8 +64,8 @@ def measure_gates(
 ) -> dict:
     """Probes and rank of a checkpoint on held-out rollouts, and a t-SNE map of latents.
 
-    Returns the fields of `Measured` and, for n = `config.shown` frames, "latent.plane" (n, 2) by t-SNE, "latent.pose"
-    (n, 3) and "latent.hazard" (n,), whether the slab is visible.
+    Returns the fields of `Measured`, "latent.sample" (R, SAMPLED, 64) of every rollout and, for n = `config.shown`
+    frames, "latent.plane" (n, 2) by t-SNE, "latent.pose" (n, 3) and "latent.hazard" (n,), whether the slab is visible.
     """
     rng = Stream.GATES.generator(seed)
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
@@ -84,7 +88,9 @@ def measure_gates(
         effective_rank(latents.reshape(-1, LATENT)),
         effective_rank(latents.reshape(-1, LATENT), power=2),
     )
-    return found._asdict() | _picture(rollouts, latents, config.shown, rng)
+    few = np.linspace(0, latents.shape[1] - 1, min(SAMPLED, latents.shape[1])).astype(int)
+    sample = {"latent.sample": latents[:, few].astype(np.float32)}
+    return found._asdict() | sample | _picture(rollouts, latents, config.shown, rng)
 
 
 def _picture(rollouts, latents, n: int, rng: np.random.Generator) -> dict:

@@ -1,103 +1,135 @@
-"""The verdicts of the pixel study: cells of Table III and its redrawn rows, collapsed seeds, cells of Table IV."""
+"""The verdicts of the pixel study: rows of Table III, collapsed seeds, cells of Table IV.
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+Samples are arrays (seeds, episodes) as in `report.judges`.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from jaxtyping import Bool, Float, Shaped
 
 from lt_lib.comm.messages import CONDITIONS
 from lt_lib.pixels.redraw import REDRAWS
-from lt_lib.report import stats
-from lt_lib.report.shares import SOLVED, final_shares
+from lt_lib.report import judges, stats
+from lt_lib.report.shares import SOLVED
+from lt_lib.report.stats import ALPHA, Outcomes
 from lt_lib.store.run import Result
 
-COLLAPSED = 1e-3  # nats of decision entropy below which a head no longer explores
-ALPHA = 0.05
-DROP_ALPHA = 0.001  # for the drop under a destroyed wire, for every head
-AT_CHANCE = (0.35, 0.65)  # route optimality under a destroyed wire
+COLLAPSED = 10**-5.5  # nats: decision entropies whose nearest power of ten is at most the paper's 1e-6
+ENTERED = (0.35, 0.65)  # route optimality of a destroyed cell: a coin of 256 tosses leaves it once in a million
+LONGER = 1.5  # times the intact episode's length
 
 
-def collapsed(head: Result) -> bool:
-    """Whether a head stopped exploring and stayed at chance."""
-    return bool(head["entropy"][-1] < COLLAPSED and final_shares([head], "optimal")[0] < SOLVED)
+def table_3(name: str) -> tuple[Callable[..., dict[str, Any]], tuple[str, ...]]:
+    """The judge of a condition of Table III, and the conditions that it is compared with.
 
-
-def judge_condition(name: str, shares: np.ndarray, floor: np.ndarray, latent: np.ndarray) -> dict[str, Any]:
-    """A cell of Table III as a finding: value, seeds, interval, and the test that its role calls for.
-
-    ours, diagnostic        above the floor, exact one-sided rank test
-    lower bound, kinematic  at chance, equivalence within +- 0.1
-    upper bound             no better than the latent, exact one-sided rank test that it falls short
+    ours, diagnostic        above the floor
+    upper bound             below the latent: the paper finds the raw image less reliable
+    lower bound, kinematic  at chance
     """
-    low, high = stats.mean_interval(shares)
-    finding = {"value": shares.mean(), "seeds": shares, "low": low, "high": high}
     match CONDITIONS[name].role:
         case "ours" | "diagnostic":
-            p, holds = stats.rank_test(shares, floor), bool(shares.min() > floor.max())
-            return finding | {"test": "exact rank test, above the floor", "p": p, "holds": holds}
+            return partial(judges.above, of="the floor"), ("floor",)
         case "upper bound":
-            return finding | {
-                "test": "exact rank test, latent above it; holds if no better",
-                "p": stats.rank_test(latent, shares),
-                "holds": bool(shares.mean() <= latent.mean()),
-                "note": f"{(shares >= SOLVED).sum()} of {len(shares)} seeds solved, the paper's 2 of 3 decide its mean",
-            }
-    p = stats.chance_equivalence(shares)
-    return finding | {"test": "equivalence with chance +- 0.1 (TOST)", "p": p, "holds": p < ALPHA}
+            return partial(judges.below, of="the latent"), ("latent",)
+    return judges.at_chance, ()
 
 
-def judge_redrawn(name: str, shares: np.ndarray, once: np.ndarray, floor: np.ndarray) -> dict[str, Any]:
-    """A cell of the redrawn rows as a finding; its test holds if the seeds of the two sides do not overlap.
-
-    once   seeds of the same content with one draw per episode: a redrawn row must lie below them
-    floor  seeds without a message: the row of one draw must lie above them
-    """
-    low, high = stats.mean_interval(shares)
-    finding = {"value": shares.mean(), "seeds": shares, "low": low, "high": high}
-    above, below = (once, shares) if REDRAWS[name].every else (shares, floor)
-    words = "below one draw of the same content" if REDRAWS[name].every else "above the floor"
-    p, holds = stats.rank_test(above, below), bool(above.min() > below.max())
-    return finding | {"test": f"exact rank test, {words}", "p": p, "holds": holds}
+def lower_block(name: str) -> tuple[Callable[..., dict[str, Any]], str]:
+    """The judge of a redrawn row, and what it is compared with: one draw of the same content, or the floor."""
+    if REDRAWS[name].every:
+        return partial(judges.below, of="one draw of the same content"), REDRAWS[name].content
+    return partial(judges.above, of="the floor"), "floor"
 
 
-def fall_test(groups: Sequence[ArrayLike]) -> dict[str, Any]:
-    """Whether the means fall from group to group, as a finding; it holds if no seed overlaps the previous group.
-
-    p is the largest of the steps' exact one-sided rank tests, since every step must be a fall.
-    """
-    steps = list(pairwise(groups))
-    falls = all(np.mean(above) > np.mean(below) for above, below in steps)
-    apart = all(np.min(above) > np.max(below) for above, below in steps)
+def entropy_collapse(entropy: Float[np.ndarray, " seeds"], shares: Float[np.ndarray, " seeds"]) -> dict[str, Any]:
+    """Seeds that stay unsolved with an entropy (nats) of the paper's order; holds if there are some, but not all."""
+    stuck = (entropy <= COLLAPSED) & (shares < SOLVED)
     return {
-        "value": "monotone" if falls else "not monotone",
-        "test": "exact rank test of every step, the largest p",
-        "p": max(stats.rank_test(above, below) for above, below in steps),
-        "holds": apart,
-        "note": "the means fall, but the seeds of two neighbouring rates overlap" if falls and not apart else "",
+        "value": f"{stuck.sum()} of {len(stuck)}",
+        "n": len(stuck),
+        "test": "unsolved, with a final decision entropy of 1e-6 nats or nearest to it: "
+        + ", ".join(f"{each:.1g}" for each in entropy),
+        "holds": bool(0 < stuck.sum() < len(stuck)),
     }
 
 
-def judge_corrupted(heads: Sequence[Mapping[str, Result]], wire: str) -> dict[str, Any]:
-    """A cell of Table IV as a finding: a destroyed wire must cost every head its choice and leave it at chance.
+def destroyed(intact: Outcomes, cell: Outcomes) -> dict[str, Any]:
+    """A cell of Table IV: destroying the wire costs every head its choice and leaves it at chance.
 
-    heads  per head, what `PixelProtocol.corrupted` returns: {wire condition: arrays over episodes}
+    Intact and destroyed episodes of a head share their draws, so each head is tested by pairs (McNemar).
     """
-    cell = np.array([head[wire]["optimal"].mean() for head in heads])
-    finding = {"value": cell.mean(), "seeds": cell}
-    if len(cell) > 1:
-        finding["low"], finding["high"] = stats.mean_interval(cell)
-    else:
-        finding["low"], finding["high"] = stats.wilson(heads[0][wire]["optimal"].sum(), heads[0][wire]["optimal"].size)
-    if wire == "intact":
-        return finding
-    counts = [(h["intact"]["optimal"].sum(), h[wire]["optimal"].sum(), h[wire]["optimal"].size) for h in heads]
-    p = max(stats.drop_test(*count) for count in counts)
-    (low, high), spread = AT_CHANCE, 1.96 * 0.5 / np.sqrt(counts[0][2])
-    return finding | {
-        "test": "Fisher exact drop from intact, largest p of the heads; each within 0.35 to 0.65",
+    p = max(stats.paired_change(*pair) for pair in zip(intact, cell, strict=True))
+    shares = cell.mean(axis=1)
+    lower = bool((shares < intact.mean(axis=1)).all())
+    (low, high), inside = ENTERED, bool(ENTERED[0] <= shares.min() and shares.max() <= ENTERED[1])
+    return judges.estimate(cell) | {
+        "test": f"McNemar's exact test of every head, the largest p; each head within {low} to {high}",
         "p": p,
-        "holds": bool(p < DROP_ALPHA and low <= cell.min() and cell.max() <= high),
-        "note": f"at chance a head's episodes alone scatter by ±{spread:.2f}",
+        "holds": p < ALPHA and lower and inside,
     }
+
+
+def one_corridor(routes: Shaped[np.ndarray, "heads episodes"]) -> dict[str, Any]:
+    """Whether every head takes one corridor in every episode."""
+    constant = bool((routes == routes[:, :1]).all())
+    return {
+        "value": "constant" if constant else "varies",
+        "test": "every head takes one corridor in every episode",
+        "holds": constant,
+        "n": len(routes),
+    }
+
+
+def longer(intact: Float[np.ndarray, "heads episodes"], zeroed: Float[np.ndarray, "heads episodes"]) -> dict[str, Any]:
+    """The range over heads of mean episode length under zeroed content; every head's must be LONGER than intact."""
+    p = max(float(stats.longer_mean(without, LONGER * with_)) for with_, without in zip(intact, zeroed, strict=True))
+    means = zeroed.mean(axis=1)
+    errors = 1.96 * zeroed.std(axis=1, ddof=1) / np.sqrt(zeroed.shape[1])
+    first, last = means.argmin(), means.argmax()
+    return {
+        "value": (means[first], means[last]),
+        "low": (means[first] - errors[first], means[last] - errors[last]),
+        "high": (means[first] + errors[first], means[last] + errors[last]),
+        "seeds": means,
+        "test": f"Welch's test of every head: longer than {LONGER} times intact; the largest p",
+        "p": p,
+        "holds": p < ALPHA,
+    }
+
+
+def both_routes(routes: Shaped[np.ndarray, "seeds episodes"], batch: int) -> dict[str, Any]:
+    """Whether every batch holds both routes in equal proportion until the head learns: the first batch of every seed.
+
+    It holds if each seed's share lies where a fair coin's would and all of them together are near one half.
+    """
+    first = routes[:, :batch]
+    slack = stats.coin_slack(len(first), first.shape[1])
+    shares = first.mean(axis=1)
+    p = stats.equivalence(first, 0.5, judges.AT_CHANCE)
+    inside = bool((np.abs(shares - 0.5) <= slack).all())
+    test = f"first batch: each seed within 0.5 ± {slack:.2f}, equivalence of all with 0.5 ± {judges.AT_CHANCE}"
+    return judges.words(inside and p < ALPHA, test, p=p, n=len(first))
+
+
+def earlier(one: Sequence[Result], other: Sequence[Result], batch: int) -> dict[str, Any]:
+    """Episodes until a batch first reaches SOLVED, of two conditions, as words for a row of ours."""
+    reached = [[episodes_until_solved(seed["optimal"], batch) for seed in side] for side in (one, other)]
+    p = stats.rank_test(reached[1], reached[0])
+    medians = [float(np.median(side)) for side in reached]
+    return {
+        "value": f"{medians[0]:,.0f} against {medians[1]:,.0f} episodes",
+        "test": "exact rank test of episodes until a batch reaches 0.9",
+        "p": p,
+        "n": len(reached[0]),
+    }
+
+
+def episodes_until_solved(optimal: Bool[np.ndarray, " episodes"], batch: int) -> int:
+    """Training episodes until a batch's route optimality first reaches SOLVED; all of them if none does."""
+    whole = len(optimal) // batch
+    shares = optimal[: whole * batch].reshape(whole, batch).mean(axis=1)
+    solved = np.flatnonzero(shares >= SOLVED)
+    return int((solved[0] + 1) * batch) if len(solved) else len(optimal)

@@ -125,6 +125,12 @@ class PixelProtocol:
         }
         return self._by_name(runs, "route heads")
 
+    def without_anchor(self, seeds: int, bank: Result, encoder: Result) -> list[Result]:
+        """Heads that get the latent without its anchor, which the paper calls spatially unusable."""
+        config = self._head("latent").model_copy(update={"wire": "anchor_zeroed"})
+        runs = [Run(train_head, config, seed, {"bank": bank, "encoder": encoder}) for seed in range(seeds)]
+        return self.store.fetch(runs, "heads without the anchor")
+
     def redrawn_heads(
         self, seeds: Mapping[str, int], bank: Result, encoder: Result, executor: Result
     ) -> dict[str, list[Result]]:
@@ -153,13 +159,15 @@ class PixelProtocol:
             results.setdefault(name, []).append(result)
         return results
 
-    def corrupted(self, name: str, head: Result, episodes: int, bank: Result, encoder: Result) -> dict[str, Result]:
-        """A frozen trained head, choosing greedily, under every wire condition of Table IV."""
+    def corrupted(
+        self, name: str, seed: int, head: Result, episodes: int, bank: Result, encoder: Result
+    ) -> dict[str, Result]:
+        """The frozen trained head of a seed under every wire condition of Table IV, greedily."""
         inputs = {"head": only(head, "head"), "bank": bank, "encoder": encoder}
         shared = {key: getattr(self.sizes.head, key) for key in ("layout", "device", "latency")}
         shared |= {"content": CONDITIONS[name].content, "episodes": episodes}
         configs = [EvaluationConfig(wire=wire, **shared) for wire in CORRUPTIONS]
-        runs = [Run(evaluate_head, config, SEED, inputs) for config in configs]
+        runs = [Run(evaluate_head, config, seed, inputs) for config in configs]
         return dict(zip(CORRUPTIONS, self.store.fetch(runs, f"corruption of {name}"), strict=True))
 
     def _head(self, name: str) -> HeadConfig:

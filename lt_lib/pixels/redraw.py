@@ -242,12 +242,13 @@ def train_redrawn_head(
                        optimal when the corridor first entered is the slab-free one
     "entropy", "draws" (updates,) nats per draw, draws in the batch
     """
-    rng = Stream.HEAD.generator(seed)  # the same scenes and random numbers as in `train_head` with this seed
+    how_often = (f"every {config.every}",) if config.every else ()  # one draw has the stream of `train_head`
+    rng = Stream.HEAD.generator(seed, config.content, "intact", *how_often)
     commit_step = scenes["commit_step"]
     arena = LiveArena(config, commit_step, encoder, executor)
     spawn, scout = (scenes[name][held_out_draws(scenes) :] for name in ("spawn", "scout"))
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(int(rng.integers(2**31)))
         head = RouteHead(ANCHOR + CONTENT)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5)
     episodes, updates = [], []

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lt_lib import ppo
-from lt_lib.comm.channel import ANCHOR, CORRUPTIONS, Channel
+from lt_lib.comm.channel import ANCHOR, WIRES, Channel
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.camera import FastCamera
@@ -114,7 +114,7 @@ def read_bank(
 def channel_of(config: HeadConfig | EvaluationConfig, senders: int, width: int, rng: np.random.Generator) -> Channel:
     """The channel with the configured latency and corruption."""
     radius = load_layout(config.layout).communication_radius
-    return Channel((senders,), width, radius, config.latency, lambda wire: CORRUPTIONS[config.wire](wire, rng))
+    return Channel((senders,), width, radius, config.latency, lambda wire: WIRES[config.wire](wire, rng))
 
 
 def train_head(
@@ -128,16 +128,16 @@ def train_head(
     """Trains one head; returns its weights, the outcome of every training episode and a greedy evaluation.
 
     "head.*"           weights
-    "optimal", "success", "contacts", "length" (episodes,) of the head's sampled choices, in order
+    "optimal", "success", "contacts", "length", "route" (episodes,) of the head's sampled choices, in order
     "entropy" (updates,) nats, "value_loss" (updates,)
     "greedy.*"         the same four and "route" of greedy choices over the held-out draws, the slab placed at random
     """
-    rng = Stream.HEAD.generator(seed)
+    rng = Stream.HEAD.generator(seed, config.content, config.wire)
     training, held_out = read_bank(config, bank, encoder)
     width = training.contents.shape[-1]
     channel = channel_of(config, config.batch, width, rng)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(int(rng.integers(2**31)))
         head = RouteHead(ANCHOR + width)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5)
     episodes, updates = [], []
@@ -153,7 +153,7 @@ def train_head(
         returns = torch.from_numpy(played.pop("returns")).float()
         batch = ppo.Batch(wire, route, policy.log_prob(route), returns - value, returns)
         statistics = ppo.update(head, optimiser, batch, config.ppo, config.minibatch, rng)
-        episodes.append(played)
+        episodes.append(played | {"route": route.numpy().astype(np.int8)})
         updates.append((policy.entropy().mean().item(), statistics.value_loss))
         report((start + n) / config.episodes)
     greedy = evaluate(head, held_out, channel_of(config, len(held_out.contents), width, rng), rng)
@@ -208,7 +208,7 @@ def evaluate_head(
 ) -> dict:
     """One cell of Table IV: a frozen trained head, choosing greedily, under one wire condition."""
     _, held_out = read_bank(config, bank, encoder)
-    rng = Stream.CORRUPTION.generator(seed)
+    rng = Stream.CORRUPTION.generator(seed, config.content)  # the wire conditions of a head share their draws
     channel = channel_of(config, config.episodes, held_out.contents.shape[-1], rng)
     return evaluate(read_head(head), held_out, channel, rng)
 

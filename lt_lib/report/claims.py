@@ -3,7 +3,7 @@
 A notebook collects its findings and writes them at its end:
 
     findings = Findings("04_pixels", folder, profile)
-    findings.add("px.latent.route", mean, seeds=seeds, low=low, high=high, test="over floor", p=p, holds=True)
+    findings.add("px.latent.route", mean, fixed=fixed, low=low, high=high, test="over floor", p=p, holds=True)
     findings.write()
 """
 
@@ -11,13 +11,15 @@ import json
 import math
 import operator
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zlib import crc32
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from lt_lib.report.firmness import firmness
 from lt_lib.settings.base import ROOT, Settings, UserError, read_yaml, require_known
 from lt_lib.settings.profiles import explain
 from lt_lib.store.files import content_digest, writable_folder, write_atomically
@@ -32,9 +34,10 @@ Numbers = Number | tuple[Number, ...]
 Value = Number | str | tuple[Number, ...]
 
 CLAIMS = ROOT / "params" / "claims.yaml"
-JUDGED = ("full", "quick")  # smaller profiles give no verdict, so that nobody takes them for results
+JUDGED = "full"  # smaller profiles have too few seeds for any test, and nobody shall take them for results
 REPRODUCED, SAME_DIRECTION, NOT_REPRODUCED = "reproduced", "same direction", "not reproduced"
-SURROGATE, NOT_RUN, NO_VERDICT = "surrogate", "not run", ""
+CALIBRATED, CONTEXT, GATE, NEEDS_A_ROBOT = "calibrated", "context", "gate", "needs a robot"
+NOT_RUN, NO_VERDICT = "not run", ""
 CRITERIA = ("digits", "margin", "at_least", "at_most", "equal", "between")
 ALLOWED = {
     "exact": ("digits", "between"),
@@ -42,7 +45,9 @@ ALLOWED = {
     "scene": CRITERIA[2:],
     "measured": CRITERIA[1:],
     "hardware": CRITERIA[1:],
+    "ours": (),
 }
+TESTED = ("measured", "hardware")  # kinds whose rows need a test that could fail
 
 
 class Claim(Settings):
@@ -50,7 +55,7 @@ class Claim(Settings):
 
     id: str
     nb: Notebook
-    kind: Literal["exact", "config", "measured", "scene", "hardware"]
+    kind: Literal["exact", "config", "measured", "scene", "hardware", "ours"]
     what: str
     paper: Value
     sd: float | None = None
@@ -58,6 +63,9 @@ class Claim(Settings):
     range: tuple[float, float] | None = None
     check: str = ""
     unit: str = ""
+    refuted: str = ""
+    follows: str = ""
+    gate: bool = False
     digits: int | None = None
     margin: Numbers | None = None
     at_least: Number | None = None
@@ -71,7 +79,9 @@ class Claim(Settings):
         allowed = ALLOWED[self.kind]
         if len(criteria) > 1 or not set(criteria) <= set(allowed):
             raise UserError(f"{self.id}: kind {self.kind} allows at most one of {allowed}, got {criteria}")
-        if not criteria and self.kind != "config" and not self.check and numbers(self.paper):
+        if self.kind in TESTED and not self.follows and not self.gate and not self.refuted:
+            raise UserError(f"{self.id}: a measured claim says what would refute it; give `refuted`")
+        if not criteria and self.kind not in ("config", "ours") and not self.check and numbers(self.paper):
             raise UserError(f"{self.id}: no criterion for reproduction; give one of {allowed} or a check")
         if isinstance(self.margin, tuple) and len(self.margin) != len(numbers(self.paper) or ()):
             raise UserError(f"{self.id}: expected one margin for each of {self.paper}, got {self.margin}")
@@ -83,9 +93,9 @@ class Claim(Settings):
         return next((name for name in CRITERIA if getattr(self, name) is not None), "")
 
     @property
-    def judged_in_words(self) -> bool:
-        """Whether only the notebook's own test can decide if the check is met."""
-        return bool(self.check) and not self.criterion and self.kind in ("measured", "hardware")
+    def tested(self) -> bool:
+        """Whether the row needs a test of its own, one that could fail."""
+        return self.kind in TESTED and not self.gate
 
 
 class Finding(Settings):
@@ -97,6 +107,8 @@ class Finding(Settings):
     n            number of seeds, or of the runs or episodes over which the value is a mean or a count
     test, p      the claim's own test in words, and its p
     holds        whether that test holds; None if the claim has no test
+    judge        name of the function that judged it, which the tests feed with a result that refutes the claim
+    firm         share of resamples of its seeds and episodes that give the same verdict; None if it has no sample
     note         a few words on a deviation: what was tried, what the cause is
     real_frames  (hardware) whether the frames came from the physical camera
     """
@@ -109,6 +121,8 @@ class Finding(Settings):
     test: str = ""
     p: Annotated[Number, Field(ge=0, le=1)] | None = None
     holds: bool | None = None
+    judge: str = ""
+    firm: Annotated[Number, Field(ge=0, le=1)] | None = None
     note: str = ""
     real_frames: bool = False
 
@@ -151,9 +165,11 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
     """The verdict on one claim.
 
     not run         there is no finding
-    '' (none)       the profile is neither full nor quick, so the run is too small to tell
-    surrogate       a hardware claim without real frames; with real frames it counts as measured
-    reproduced      the claim's criterion (below) is met, and its own test, if it has one, holds
+    '' (none)       the profile is not the full one, so the run is too small to tell
+    needs a robot   a hardware claim without real frames; with real frames it counts as measured
+    gate            a threshold that stops the run where it is missed, so the row cannot fail
+    context         geometry or settings that the paper does not print, or a finding that it does not have
+    reproduced      the claim's criterion (below) is met, and its own test, which could have failed, holds
     same direction  a measured claim misses its criterion, but its own test holds
     not reproduced  everything else
 
@@ -161,24 +177,33 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
     exact           prints like the paper's value at its number of digits
     config          equals the paper's value; numbers to a part in 1e9
     others          lies within the margin or meets the machine-readable check; equals the paper's words; without
-                    either, the check in words, which the notebook's test decides (scene: any finding meets it)
+                    either, the notebook's test decides alone
     """
     if finding is None:
         return NOT_RUN
-    if profile not in JUDGED:
+    if profile != JUDGED:
         return NO_VERDICT
     if claim.kind == "hardware" and not finding.real_frames:
-        return SURROGATE
-    if finding.holds is not False and _criterion_met(claim, finding):
+        return NEEDS_A_ROBOT
+    met = _criterion_met(claim, finding)
+    if claim.kind in ("scene", "ours") and met:
+        return CONTEXT
+    if claim.gate and met:
+        return GATE
+    if finding.holds is False or (claim.tested and finding.holds is None):
+        return NOT_REPRODUCED
+    if met:
         return REPRODUCED
-    return SAME_DIRECTION if finding.holds and claim.kind in ("measured", "hardware") else NOT_REPRODUCED
+    return SAME_DIRECTION if claim.tested else NOT_REPRODUCED
 
 
 def _criterion_met(claim: Claim, finding: Finding) -> bool:
     """Whether the finding meets the criterion of its claim; see `verdict`."""
     ours, paper = numbers(finding.value), numbers(claim.paper)
+    if claim.kind == "ours":
+        return True
     if paper is None:
-        return finding.value == claim.paper and (finding.holds is True or not claim.judged_in_words)
+        return finding.value == claim.paper
     papers = paper * len(ours) if len(paper) == 1 else paper
     match claim.criterion:
         case "digits":
@@ -197,7 +222,7 @@ def _criterion_met(claim: Claim, finding: Finding) -> bool:
             return claim.between[0] <= min(ours) and max(ours) <= claim.between[1]
     if claim.kind == "config":
         return all(map(math.isclose, ours, papers))
-    return finding.holds is True or claim.kind == "scene"
+    return True  # the check is in words alone
 
 
 class Findings:
@@ -225,7 +250,7 @@ class Findings:
 
         Raises a one-line UserError with the id for an id that belongs to another notebook or was already added, an
         unknown field, a value that is not finite or not shaped like the paper's, an inverted interval, and a missing
-        `holds` where the check exists only in words.
+        `holds` of a measured claim.
         """
         where = f"{self.notebook}: {name}"
         if name not in self.claims:
@@ -240,6 +265,34 @@ class Findings:
         finding = _parse(Finding, entry, where)
         _check_shape(self.claims[name], finding, where)
         self.found[name] = finding
+
+    def judge(
+        self,
+        name: str,
+        judge: Callable[..., Mapping[str, Any]],
+        *samples: np.ndarray,
+        paired: bool = False,
+        fixed: bool = False,
+        **fields: Any,
+    ) -> dict[str, Any]:
+        """Adds what `judge(*samples)` finds, with how firm the verdict is; returns what it found.
+
+        judge    a function of `report.judges` or of a study's judgements, or a partial of one
+        paired, fixed  how the samples are resampled, see `report.firmness`
+        fields   further fields of `Finding`; they take precedence
+        """
+        if name not in self.claims:
+            raise UserError(f"{self.notebook}: {name} is not one of its claims; they are {', '.join(self.claims)}")
+        claim, found = self.claims[name], dict(judge(*samples)) | fields
+
+        def judged(*resampled: np.ndarray) -> str:
+            entry = {key: _plain(item) for key, item in (dict(judge(*resampled)) | fields).items()}
+            return verdict(claim, Finding(**entry | {"real_frames": True}), JUDGED)
+
+        rng = np.random.default_rng(crc32(name.encode()))
+        firm = firmness(judged, samples, rng, paired=paired, fixed=fixed)
+        self.add(name, **found, judge=getattr(judge, "func", judge).__name__, firm=firm)
+        return found
 
     def write(self, pending: Collection[str] = ()) -> Path:
         """Writes the results file, whole or not at all, and returns its path.
@@ -282,13 +335,17 @@ def _check_shape(claim: Claim, finding: Finding, where: str) -> None:
     alike = isinstance(finding.value, str) if paper is None else ours and len(paper) in (1, len(ours))
     if not alike:
         raise UserError(f"{where}: value {finding.value!r} is not comparable with the paper's {claim.paper!r}")
-    if claim.judged_in_words and finding.holds is None:
-        raise UserError(f"{where}: holds must be True or False, because its check is only in words: {claim.check}")
-    if finding.low is None and finding.high is None:
-        return
-    if finding.low is None or finding.high is None:
+    if (finding.low is None) != (finding.high is None):
         raise UserError(f"{where}: low and high go together, got {finding.low} and {finding.high}")
-    lows, highs = numbers(finding.low), numbers(finding.high)
+    if finding.low is not None:
+        _check_interval(finding, where)
+    if claim.tested and finding.holds is None:
+        raise UserError(f"{where}: holds must be True or False, because a measured claim needs a test that could fail")
+
+
+def _check_interval(finding: Finding, where: str) -> None:
+    """Raises UserError unless there is one low and one high end for each number of the value."""
+    ours, lows, highs = (numbers(each) for each in (finding.value, finding.low, finding.high))
     if not len(lows) == len(highs) == len(ours or ()) or any(map(operator.gt, lows, highs)):
         raise UserError(
             f"{where}: expected low <= high for each number of the value, got {finding.low}, {finding.high}"

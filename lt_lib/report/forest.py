@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lt_lib.report.claims import JUDGED, NOT_RUN, Claim, Number, numbers
-from lt_lib.report.scoreboard import MARKS, Mark, shown, stamp, summary, told
+from lt_lib.report.scoreboard import MARKS, Mark, printed, stamp, summary, told
 
 ROW = 0.23  # inches per claim
 SPREAD = 0.4  # rows spanned by the components of a list
@@ -28,7 +28,11 @@ def figure(board: pd.DataFrame, claims: Mapping[str, Claim], profile: str) -> Fi
     board   from `scoreboard.join`
     claims  those that the board was made from; their units separate the panels
     """
-    rows = board[(board.kind == "measured") & board.id.map(lambda name: numbers(claims[name].paper) is not None)]
+    rows = board[
+        (board.kind == "measured")
+        & (board.follows == "")
+        & board.id.map(lambda name: numbers(claims[name].paper) is not None)
+    ]
     units = rows.id.map(lambda name: claims[name].unit)
     panels = [rows.assign(unit=units)[units == ""], rows.assign(unit=units)[units != ""]]
     heights = [len(panel) + panel.notebook.nunique() for panel in panels]
@@ -40,12 +44,11 @@ def figure(board: pd.DataFrame, claims: Mapping[str, Claim], profile: str) -> Fi
     _forest(lower, panels[1])
     lower.set(xlim=(-0.05, WIDEST + 0.05), xlabel=f"ours / paper (arrow: beyond {WIDEST})")
     _legend(upper, board)
-    fig.suptitle(
-        "\n".join(filter(None, ["Paper against ours: every measured claim", summary(board), stamp(board, profile)]))
-    )
-    if profile not in JUDGED:
+    title = ["Paper against ours: every measured number, once", summary(board), stamp(board, profile)]
+    fig.suptitle("\n".join(textwrap.fill(line, 130) for line in title if line))
+    if profile != JUDGED:
         for height in (0.25, 0.7):
-            fig.text(0.5, height, "SMOKE: not a result", rotation=35, fontsize=64, alpha=0.12, ha="center")
+            fig.text(0.5, height, f"{profile.upper()}: not a result", rotation=35, fontsize=64, alpha=0.12, ha="center")
     return fig
 
 
@@ -83,7 +86,7 @@ def _claim(axes: Axes, row: Mapping[str, Any], y: Number) -> None:
             interval = [_place(end[i], paper, row) for end in (lows, highs) if end]
             axes.plot(interval, [at] * len(interval), color=mark.colour, lw=1.6, zorder=1)
             _dot(axes, _place(ours[i], paper, row), at, mark)
-    text = f"{shown(row['paper'])}  →  {shown(row['ours'])}" if ours else shown(row["paper"])
+    text = f"{printed(row['paper'])}  →  {printed(row['ours'])}" if ours else printed(row["paper"])
     side = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 7.5}
     axes.text(1.01, y, mark.sign, color=mark.colour, fontweight="bold", **side)
     axes.text(1.035, y, f"{text} {row['unit']}", color="0.5" if row["verdict"] == NOT_RUN else "black", **side)

@@ -9,6 +9,7 @@ WORDS = {
     "hazard": "hazard-visible probe",
     "majority": "majority baseline",
     "walls": "wall-count R²",
+    "appearance": "R² of floor and wall colours",
     "share": "hazard's share of variance",
     "rank": "effective rank",
     "rank_eigen": "(by eigenvalues)",

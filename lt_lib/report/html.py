@@ -18,7 +18,7 @@ from nbconvert import HTMLExporter
 from nbconvert.filters import markdown2html
 from traitlets.config import Config
 
-from lt_lib.report.scoreboard import MARKS, told
+from lt_lib.report.scoreboard import MARKS
 from lt_lib.settings.base import ROOT, UserError
 from lt_lib.store.files import writable_folder, write_atomically
 
@@ -118,9 +118,9 @@ def _scoreboard(board: str, names: Sequence[str]) -> str:
     for name in names:
         page = re.sub(rf"(<h3[^>]*>){name}", rf"\1{_linked(name, names)}", page)
         page = page.replace(f'<a href="notebooks/{name}.ipynb">{name}</a>', _linked(name, names))
-    for kind, mark in MARKS.items():
-        cell = f'<td class="verdict" style="color: {mark.colour}">{told(kind)}</td>'
-        page = page.replace(f"<td>{told(kind)}</td>", cell)
+    for mark in MARKS.values():  # the sign tells a verdict, whatever stands behind it
+        cell = rf'<td class="verdict" style="color: {mark.colour}">\1</td>'
+        page = re.sub(rf"<td>({re.escape(mark.sign)} [^<]*)</td>", cell, page)
     return page
 
 

@@ -1,13 +1,20 @@
-"""The loss curves of an encoder's training, which the pixel and the gridworld sections both show."""
+"""What encoders show in notebooks: the losses of their training, and whether their guards keep the rank up."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from lt_lib.perception.gates import effective_rank
+from lt_lib.report import judges, stats
+from lt_lib.report.stats import ALPHA
 from lt_lib.report.style import ROLES
 from lt_lib.store.run import Result
+
+PARTS = 6  # groups of rollouts, each with an effective rank of its own
 
 
 def loss_curves(encoders: Mapping[str, Result]) -> Figure:
@@ -26,3 +33,17 @@ def loss_curves(encoders: Mapping[str, Result]) -> Figure:
     axes.legend(fontsize=8)
     figure.supylabel("loss, mean of 10 updates")
     return figure
+
+
+def rank_falls(
+    guarded: Float[np.ndarray, "rollouts frames d"], bare: Float[np.ndarray, "rollouts frames d"], *, of: str
+) -> dict[str, Any]:
+    """Whether latents have a higher effective rank than others, over groups of rollouts (exact rank test)."""
+    ranks = [
+        [effective_rank(part.reshape(-1, part.shape[-1])) for part in np.array_split(side, PARTS)]
+        for side in (guarded, bare)
+    ]
+    p = stats.rank_test(*ranks)
+    means = " and ".join(f"{np.mean(side):.1f}" for side in ranks)
+    test = f"exact rank test over {PARTS} groups of rollouts, above {of}: {means}"
+    return judges.words(p < ALPHA, test, p=p, n=len(guarded))

@@ -5,29 +5,39 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 from pandas.io.formats.style import Styler
 from pydantic import ValidationError
 
 from lt_lib.report.claims import (
+    CALIBRATED,
+    CONTEXT,
+    GATE,
     JUDGED,
+    NEEDS_A_ROBOT,
     NO_VERDICT,
     NOT_REPRODUCED,
     NOT_RUN,
     REPRODUCED,
     SAME_DIRECTION,
-    SURROGATE,
     Claim,
     Finding,
     Findings,
     verdict,
 )
+from lt_lib.report.firmness import FRAGILE
 from lt_lib.settings.base import Settings, UserError
 from lt_lib.settings.profiles import explain
 from lt_lib.store.files import content_digest, writable_folder, write_atomically
 
+TESTED_VERDICTS = (REPRODUCED, SAME_DIRECTION, NOT_REPRODUCED)
 DISCUSSED = "discussed in"  # the notebook that says what was tried and what the likeliest cause is
-COLUMNS = ["id", "notebook", "what", "kind", "paper", "ours", "low", "high", "n", "test", "p", "verdict"]
+COLUMNS = [
+    "id", "notebook", "what", "kind", "paper", "ours", "low", "high", "n", "test", "p", "verdict", "firm", "follows",
+    "note",
+]  # fmt: skip
+SETTINGS = ("exact", "config")  # kinds that are settings and arithmetic, not outcomes
 
 
 class Mark(NamedTuple):
@@ -42,18 +52,26 @@ MARKS = {
     REPRODUCED: Mark("#0072B2", "o", "✔"),
     SAME_DIRECTION: Mark("#E69F00", "^", "≈"),
     NOT_REPRODUCED: Mark("#D55E00", "X", "✘"),
-    SURROGATE: Mark("#CC79A7", "s", "◌"),
+    CALIBRATED: Mark("#56B4E9", "v", "≙"),
+    GATE: Mark("#009E73", "D", "▣"),
+    CONTEXT: Mark("#999933", "P", "○"),
+    NEEDS_A_ROBOT: Mark("#CC79A7", "s", "◌"),
     NO_VERDICT: Mark("#555555", "o", "?"),
     NOT_RUN: Mark("#999999", "", "·"),
 }
 LEGEND = """\
-Verdicts: ✔ **reproduced** - exact numbers print alike, settings are equal, measured values lie within the
-margin that `params/claims.yaml` fixed beforehand (or meet the check stated there), and the claim's own test
-holds; ≈ **same direction** - the test holds, but the value lies outside the margin; ✘ **not reproduced** - the
-test fails, or there is no test and the value lies outside the margin; ◌ **surrogate** - made with a simulated
-camera where the paper used the robot's; · **not run** - no finding. A rank test holds if no seed overlaps the
-seeds it is compared with. A scene number whose check is 'reported' depends on geometry that the paper does not
-print, so it only has to stand beside the paper's."""
+Verdicts: ✔ **reproduced** - the number lies within its margin (`params/claims.yaml`) and the row's own test, which
+could have failed, holds; settings are equal, exact numbers print alike; ≈ **same direction** - the test of the
+paper's statement holds, but the number lies outside its margin; ✘ **not reproduced** - the test fails; ≙
+**calibrated** - a setting that the paper does not print was inferred from this row, so it counts for nothing; ▣
+**gate** - the run stops where this threshold is missed, so the row cannot fail; ○ **context** - geometry or
+settings that the paper does not print, or a finding of ours that it does not have; ◌ **needs a robot** - made with
+a simulated camera; · **not run** - no finding.
+
+*Firm* is the share of resamples of a row's seeds and episodes that give the same verdict; below 0.8 it is
+*fragile*. A row that *follows* another restates it and is not counted again. The rules of all tests stand in
+`lt_lib/report/stats.py`; what would refute a row stands in `params/claims.yaml`, and the tests feed every judge
+with such a result."""
 
 
 class _Entry(Finding):
@@ -136,6 +154,9 @@ def _row(claim: Claim, finding: Finding | None, profile: str) -> dict[str, Any]:
         "ours": found.pop("value"),
         **found,
         "verdict": verdict(claim, finding, profile),
+        "firm": finding.firm if finding else None,
+        "follows": claim.follows,
+        "note": finding.note if finding else "",
     }
 
 
@@ -143,29 +164,46 @@ def _as_list(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def deviations(board: pd.DataFrame, findings: Mapping[str, Finding]) -> pd.DataFrame:
-    """The rows that depart from the paper, not reproduced first, with notes and the notebook that discusses each."""
-    rows = [board[board.verdict == kind] for kind in (NOT_REPRODUCED, SAME_DIRECTION)]
-    part = pd.concat(rows)[["id", "what", "paper", "ours", "low", "high", "test", "p", "verdict", "notebook"]]
-    notes = [findings[name].note for name in part.id]
-    return part.rename(columns={"notebook": DISCUSSED}).assign(note=notes)
+def deviations(board: pd.DataFrame) -> pd.DataFrame:
+    """The rows that depart from the paper, not reproduced first, with the notebook that discusses each."""
+    parts = [board[(board.verdict == kind) & (board.follows == "")] for kind in (NOT_REPRODUCED, SAME_DIRECTION)]
+    return pd.concat(parts).rename(columns={"notebook": DISCUSSED})
+
+
+def independent(board: pd.DataFrame) -> pd.DataFrame:
+    """The measured facts, each once: no settings, no context, no gates, and no row that follows from another."""
+    apart = (*SETTINGS, "scene", "ours")
+    return board[~board.kind.isin(apart) & (board.follows == "") & ~board.verdict.isin((GATE, NEEDS_A_ROBOT))]
 
 
 def summary(board: pd.DataFrame) -> str:
-    """The verdicts in one line, e.g. '61 reproduced, 3 same direction, 2 not reproduced, 80 not run, of 146'."""
-    counts = board.verdict.value_counts()
-    names = {NO_VERDICT: "without a verdict"}
+    """The verdicts in two sentences: each measured fact once, then whatever is counted apart."""
+    facts = independent(board)
+    counts, names = facts.verdict.value_counts(), {NO_VERDICT: "without a verdict"}
     parts = [f"{counts[kind]} {names.get(kind, kind)}" for kind in MARKS if kind in counts]
-    return f"{', '.join(parts)}, of {len(board)}"
+    fragile = int((facts.firm.dropna().astype(float) < FRAGILE).sum())
+    settings = board[board.kind.isin(SETTINGS) & ~board.verdict.isin((GATE,))]
+    agree = int((settings.verdict == REPRODUCED).sum())
+    apart = {
+        "settings and exact numbers": f"{agree} of {len(settings)}",
+        "rows that follow from another": (board.follows != "").sum(),
+        "gates": (board.verdict == GATE).sum(),
+        "context": board.kind.isin(("scene", "ours")).sum(),
+        "needs a robot": (board.verdict == NEEDS_A_ROBOT).sum(),
+    }
+    rest = ", ".join(f"{words} {count}" for words, count in apart.items() if count)
+    return (
+        f"Of {len(facts)} independent measured claims: {', '.join(parts)} ({fragile} fragile). Counted apart: {rest}."
+    )
 
 
 def stamp(board: pd.DataFrame, profile: str) -> str:
     """The stamp on every table and figure below the paper's scale; '' for the full profile."""
     sizes = [int(n) for n in board.n.dropna()]
     n = f"n = {min(sizes)} to {max(sizes)}" if sizes else "no findings"
-    if profile == "full":
+    if profile == JUDGED:
         return ""
-    return f"profile {profile}, {n}" if profile in JUDGED else f"SMOKE: not a result (profile {profile}, {n})"
+    return f"{profile.upper()}: not a result (profile {profile}, {n})"
 
 
 def headline(board: pd.DataFrame) -> str:
@@ -175,13 +213,13 @@ def headline(board: pd.DataFrame) -> str:
     return _table(rows, ["message", "n", "paper", "ours", "p", "verdict"])
 
 
-def markdown(board: pd.DataFrame, findings: Mapping[str, Finding], profile: str) -> str:
-    """The whole board as Markdown: summary, stamp, legend, deviations with notes, one table per notebook."""
+def markdown(board: pd.DataFrame, profile: str) -> str:
+    """The whole board as Markdown: summary, stamp, legend, deviations, one table per notebook."""
     mark = stamp(board, profile)
     parts = ["# Scoreboard", f"**{summary(board)}**", *([f"**{mark}**"] if mark else []), LEGEND]
-    unlike = deviations(board, findings)
+    unlike = deviations(board)
     if len(unlike):
-        columns = ["id", "what", "paper", "ours", "test", "p", "verdict", "note", DISCUSSED]
+        columns = ["id", "what", "paper", "ours", "test", "p", "verdict", "firm", "note", DISCUSSED]
         parts += ["## Not as in the paper", _table(unlike, columns)]
     for notebook, rows in board.groupby("notebook"):
         columns = [name for name in COLUMNS if name not in ("notebook", "low", "high")]
@@ -197,40 +235,52 @@ def _table(rows: pd.DataFrame, columns: Sequence[str]) -> str:
 
 
 def _cell(row: Mapping[str, Any], column: str) -> str:
-    if column == "verdict":
-        return told(row["verdict"])
-    text = shown(row[column])
     if column == DISCUSSED:
-        return f"[{text}](notebooks/{text}.ipynb)"
-    if column == "ours" and row["low"] is not None:
-        text += f" [{shown(row['low'])}, {shown(row['high'])}]"
+        return f"[{row[column]}](notebooks/{row[column]}.ipynb)"
+    if column == "verdict":
+        return told(row["verdict"], row["firm"])
+    text = estimated(row["ours"], row["low"], row["high"]) if column == "ours" else printed(row[column], column)
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-def told(kind: str) -> str:
-    """A verdict with its sign; without a verdict, the word that says why."""
-    return f"{MARKS[kind].sign} {kind or 'smoke'}"
+def told(kind: str, firm: float | None = None) -> str:
+    """A verdict with its sign, marked where it is fragile; without a verdict, the word that says why."""
+    fragile = " (fragile)" if firm is not None and firm < FRAGILE and kind in TESTED_VERDICTS else ""
+    return f"{MARKS[kind].sign} {kind or 'no verdict'}{fragile}"
 
 
-def shown(value: Any) -> str:
-    """A value for readers: four significant digits, lists component by component, nothing for None."""
-    if value is None:
+def estimated(value: Any, low: Any, high: Any) -> str:
+    """A value with its interval, component by component: '0.785 [0.731, 0.831], 0.859 [0.812, 0.897]'."""
+    if low is None:
+        return printed(value)
+    values, lows, highs = ((x if isinstance(x, (list, tuple)) else [x]) for x in (value, low, high))
+    parts = zip(values, lows, highs, strict=True)
+    return ", ".join(f"{printed(v)} [{printed(a)}, {printed(b)}]" for v, a, b in parts)
+
+
+def printed(value: Any, column: str = "") -> str:
+    """A value for readers: three decimals, p with two significant digits, nothing for None."""
+    if value is None or (isinstance(value, float) and np.isnan(value)):
         return ""
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(shown, value))
+        return ", ".join(map(printed, value))
+    if isinstance(value, str):
+        return value
+    if column == "p" or (isinstance(value, float) and 0 < abs(value) < 0.001):
+        return f"{value:.2g}"
     if isinstance(value, float) and abs(value) < 1000:
-        return f"{value:.4g}"
-    return value if isinstance(value, str) else f"{value:,.0f}"
+        return f"{value:.2f}" if column == "firm" else f"{value:.3f}"
+    return f"{value:,.0f}"
 
 
 def styled(rows: pd.DataFrame, board: pd.DataFrame, profile: str) -> Styler:
     """Some rows of a board for display in a notebook, with coloured verdicts under the board's stamp."""
     colours = {kind: f"color: {mark.colour}; font-weight: bold" for kind, mark in MARKS.items()}
-    rows = rows.drop(columns="notebook", errors="ignore")
+    columns = ["id", "what", "paper", "ours", "n", "test", "p", "verdict", "note"]
+    shown = [{name: _cell(row, name) for name in columns} for row in rows.to_dict("records")]
+    cells = pd.DataFrame(shown, columns=columns)
     return (
-        rows.style.format(shown, subset=rows.columns.drop("verdict"))
-        .format(told, subset=["verdict"])
-        .map(colours.get, subset=["verdict"])
+        cells.style.apply(lambda _: [colours[kind] for kind in rows.verdict], subset=["verdict"])
         .hide(axis="index")
         .set_caption(stamp(board, profile))
         .set_properties(**{"text-align": "left"})
@@ -243,8 +293,10 @@ def own(findings: Findings) -> Styler:
     return styled(board[board.id.isin(findings.found)], board, findings.profile)
 
 
-def write(board: pd.DataFrame, findings: Mapping[str, Finding], outputs: Path, profile: str) -> None:
-    """Writes scoreboard.csv and scoreboard.md, each whole or not at all; raises UserError if they cannot be written."""
+def write(board: pd.DataFrame, outputs: Path, profile: str) -> None:
+    """Writes scoreboard.csv, scoreboard.md and headline.md; raises UserError if they cannot be written."""
     writable_folder(Path(outputs))
+    summed = f"{headline(board)}\n\n{summary(board)}\n"
+    write_atomically(Path(outputs) / "headline.md", summed.encode())
     write_atomically(Path(outputs) / "scoreboard.csv", board.to_csv(index=False).encode())
-    write_atomically(Path(outputs) / "scoreboard.md", markdown(board, findings, profile).encode())
+    write_atomically(Path(outputs) / "scoreboard.md", markdown(board, profile).encode())

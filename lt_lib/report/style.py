@@ -35,8 +35,10 @@ def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str)
     name     file name in <outputs>/figures, e.g. '04_routes'
     """
     figure.supxlabel(f"profile {profile}; {made_of}", fontsize=8, color="0.35")
-    if profile not in JUDGED:
-        figure.text(0.5, 0.5, "SMOKE: not a result", rotation=20, fontsize=34, alpha=0.13, ha="center", va="center")
+    if profile != JUDGED:
+        figure.text(
+            0.5, 0.5, f"{profile.upper()}: not a result", rotation=20, fontsize=34, alpha=0.13, ha="center", va="center"
+        )
     folder = outputs / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.png"

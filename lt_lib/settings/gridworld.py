@@ -1,6 +1,6 @@
 """Settings of the gridworld."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -35,13 +35,15 @@ class PatchGates(Settings):
 class GridConfig(Scene):
     """The gridworld's receiver, trained by MAPPO (Sections Implementation, Gridworld)."""
 
-    decided = (*Scene.decided, "content", "latency")
+    decided = (*Scene.decided, "content", "latency", "value_gain", "view")
     layout: str = "grid"
     content: str = "latent"  # a name in gridworld.wires.GRID_CONTENTS
+    view: Literal["cells", "pixels"] = "cells"  # a name in gridworld.views.VIEWS
+    value_gain: NonNegativeFloat = 0.0  # of the value projection's orthogonal start; 0 starts it at zero
     latency: NonNegativeInt = LATENCY  # steps
     steps: PositiveInt = 1_200_000
     envs: PositiveInt = 64
-    rollout: PositiveInt = 512  # steps per environment and update
+    rollout: PositiveInt = 375  # steps per environment and update, so that the paper's steps are whole updates
     minibatch: PositiveInt = 1_024
     lr: PositiveFloat = 1e-3
     ppo: PpoConfig = PpoConfig()

@@ -38,7 +38,7 @@ class HeadConfig(Training):
 
     decided = (*Training.decided, "content", "wire", "latency")
     content: str = "latent"  # a name in comm.messages.CONTENTS
-    wire: str = "intact"  # a name in comm.channel.CORRUPTIONS
+    wire: str = "intact"  # a name in comm.channel.WIRES
     latency: NonNegativeInt = LATENCY  # control steps
     episodes: PositiveInt = 6_000
     batch: PositiveInt = 256

@@ -1,6 +1,7 @@
-"""Random streams, one per purpose: two runs of one seed share random numbers only where they share a stream."""
+"""Random streams, named by purpose, condition and seed: runs share random numbers only where they share all three."""
 
 from enum import IntEnum, unique
+from zlib import crc32
 
 import numpy as np
 
@@ -27,6 +28,6 @@ class Stream(IntEnum):
     MATCHED_ENCODER = 15
     MATCHED_GATES = 16
 
-    def generator(self, seed: int) -> np.random.Generator:
-        """The generator of this stream for a seed."""
-        return np.random.default_rng([seed, self.value])
+    def generator(self, seed: int, *condition: str) -> np.random.Generator:
+        """The generator of this stream for a seed, and for a condition where several are compared."""
+        return np.random.default_rng([seed, self.value, *(crc32(name.encode()) for name in condition)])

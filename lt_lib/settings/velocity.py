@@ -42,6 +42,12 @@ class NavigatorConfig(Training):
     ppo: PpoConfig = PpoConfig()
     precision: Precision = "float32"
 
+    @property
+    def condition(self) -> tuple[str, ...]:
+        """What one training differs in from another, by which its random stream is named."""
+        varied = ("layout", "content", "blocked", "hazard", "starts", "spawn_share", "boost")
+        return (*(f"{name} {getattr(self, name)}" for name in varied), f"gamma {self.ppo.gamma}")
+
 
 class Exploration(Settings):
     """One row of Table II: lateral AR(1) noise imposed on the first `window` steps of an episode."""

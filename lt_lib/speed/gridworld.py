@@ -14,6 +14,7 @@ from lt_lib.gridworld import table_ppo
 from lt_lib.gridworld.map import GOAL_REWARD, HORIZON, SLAB_REWARD, STEP_REWARD, Grid
 from lt_lib.gridworld.mappo import Inputs, TableTeam, Team, batch
 from lt_lib.gridworld.patches import FrozenPatchEncoder
+from lt_lib.gridworld.views import cells
 from lt_lib.gridworld.walks import States, first_states, walk
 from lt_lib.gridworld.wires import GRID_CONTENTS
 from lt_lib.settings.gridworld import GridConfig
@@ -28,8 +29,9 @@ def rates(config: GridConfig, encoder: Result, rounds: int = 2) -> pd.DataFrame:
             update goes through the receiver and autograd (`ppo.update`)
     tables  what `gridworld.mappo.train_grid` does
     """
-    grid, frozen = Grid(load_layout(config.layout)), FrozenPatchEncoder(encoder)
-    inputs = Inputs.of(grid, frozen, config.content)
+    grid = Grid(load_layout(config.layout))
+    views = cells(grid, encoder)
+    frozen, inputs = views.encoder, Inputs.of(grid, views, config.content)
     learners = {
         "plain loop": _Plain(grid, frozen, Team(inputs), config),
         "tables": _Tables(grid, TableTeam(inputs), config),

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 
+from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
@@ -57,6 +58,35 @@ def control_step(
         arena.step(driver.mean_action(latent, route))
 
     return step
+
+
+class _Counting(FrozenEncoder):
+    """A frozen encoder that remembers which frames it has taken."""
+
+    def __init__(self, weights: Result):
+        super().__init__(weights)
+        self.taken: set[bytes] = set()
+
+    def latent(self, observations):
+        self.taken.update(frame.tobytes() for frame in observations)
+        return super().latent(observations)
+
+
+def encoder_passes(layout: Layout, encoder: Result) -> dict[str, int]:
+    """Frames that the encoder takes in one control step of two robots which both need their latents, by message.
+
+    A frame that was encoded already in this step is not counted again: its latent is at hand.
+    """
+    arena, _ = _started(layout, 1)
+    poses, others = np.vstack([arena.pose, arena.scout]), np.vstack([arena.scout, arena.pose])[:, :2]
+    frames = FastCamera(layout).frames(poses, np.repeat(arena.slab, 2), others)  # (2, H, W): navigator's, scout's
+    counted = {}
+    for content in ("floor", "latent"):
+        counting = _Counting(encoder)
+        counting.latent(frames)
+        CONTENTS[content](Sender(layout, counting, frames[1:], arena.scout, np.zeros((1, 2)), arena.slab))
+        counted[content] = len(counting.taken)
+    return counted
 
 
 def _started(layout: Layout, envs: int) -> tuple[Arena, np.ndarray]:

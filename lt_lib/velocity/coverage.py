@@ -41,6 +41,21 @@ WINDOWED: Mapping[str, Exploration] = MappingProxyType(
         "cov.episode_ar": Exploration(sigma=1.65, tau=30.0),
     }
 )
+# What the paper says of each row: the coverage that is not reached (below) or exceeded (above), and whether success is
+# that of a competent navigator; it prints one half for the window, which is neither
+STATED: Mapping[str, tuple[str, float, bool | None]] = MappingProxyType(
+    {
+        "cov.s055_t0": ("below", 0.05, True),
+        "cov.s055_t30": ("below", 0.05, True),
+        "cov.s100_t0": ("below", 0.05, True),
+        "cov.s100_t30": ("below", 0.1, False),
+        "cov.s100_t100": ("below", 0.1, False),
+        "cov.s165_t30": ("above", 0.05, False),
+        "cov.s165_t100": ("above", 0.05, False),
+        "cov.window_ar": ("above", 0.05, None),
+        "cov.episode_ar": ("above", 0.05, False),
+    }
+)
 
 
 class Episodes(NamedTuple):
@@ -178,7 +193,7 @@ def roll_navigator(
     Returns the arrays of `Episodes`, each (rows, episodes, ...), and "slab" (rows, episodes), the blocked corridor
     (0 left, 1 right). "path" has only the first `config.paths` episodes of each row.
     """
-    rng = Stream.ROLLOUT.generator(seed)
+    rng = Stream.ROLLOUT.generator(seed, config.content, config.start, *map(str, config.rows))
     shape = (len(config.rows), config.episodes)
     fixed = None if config.blocked == "random" else SIDES.index(config.blocked)
     slab = rng.integers(0, SLABS, shape) if fixed is None else np.full(shape, fixed)

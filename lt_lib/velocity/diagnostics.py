@@ -4,7 +4,7 @@ They test perception, channel and controller; in the paper they find no fault in
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from sklearn.linear_model import LogisticRegression
 
 from lt_lib.comm.channel import ANCHOR
@@ -19,8 +19,10 @@ from lt_lib.velocity.navigator import Scouts
 SETTLED = 2  # control steps after which a newly commanded velocity is reached
 
 
-def probe_accuracy(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator) -> float:
-    """Held-out accuracy of a linear probe that reads the blocked corridor off the scout's latent.
+def probe_right(
+    layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.random.Generator
+) -> Bool[np.ndarray, " held_out"]:
+    """Which held-out draws a linear probe gets right that reads the blocked corridor off the scout's latent.
 
     draws  of the scene; the probe is fitted to the first half and scored on the second
     """
@@ -28,7 +30,7 @@ def probe_accuracy(layout: Layout, encoder: FrozenEncoder, draws: int, rng: np.r
     latents = encoder.latent(FastCamera(layout).frames(scenes.scout, slab, scenes.spawn[:, :2])).cpu().numpy()
     half = draws // 2
     probe = LogisticRegression(max_iter=2000).fit(latents[:half], slab[:half])
-    return float(probe.score(latents[half:], slab[half:]))
+    return probe.predict(latents[half:]) == slab[half:]
 
 
 def message_error(

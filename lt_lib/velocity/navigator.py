@@ -176,9 +176,9 @@ def train_navigator(
     "sigma" (U, 3)     the policy's own standard deviations after every update
     "boost" (U,)       factor on the lateral one in the window
     """
-    rng = Stream.NAVIGATOR.generator(seed)
+    rng = Stream.NAVIGATOR.generator(seed, *config.condition)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(int(rng.integers(2**31)))
         navigator = read_navigator(start) if start else Navigator()
     errand = Errand(config, FrozenEncoder(encoder, config.device, config.precision), rng)
     chains = Ar1(np.full(config.envs, config.boost.tau), rng)
