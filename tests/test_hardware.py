@@ -18,7 +18,7 @@ from lt_lib.hardware.probe import decoded, fit_probe, frechet, placements_right,
 from lt_lib.hardware.protocol import FILMED, HardwareProtocol, past_the_rails
 from lt_lib.hardware.randomise import NOT_RED, TEXTURED, draw_appearances, recoloured
 from lt_lib.hardware.real_frames import read_sessions
-from lt_lib.hardware.registration import GATES, RECORD, read_gates, register
+from lt_lib.hardware.registration import GATES, RECORD, read_gates, registered_gates
 from lt_lib.hardware.sessions import EFFECTS, Session, film_session, film_sweep, simulated_session, with_effect
 from lt_lib.hardware.surrogate import SurrogateScene
 from lt_lib.perception.encoder import FrozenEncoder
@@ -378,16 +378,16 @@ def test_the_red_rule_counts_pixels_redder_than_the_ratio():
 def test_a_gate_file_that_changed_after_the_first_use_is_told(tmp_path):
     gates_file, outputs = tmp_path / "hardware.yaml", tmp_path / "outputs"
     shutil.copy(GATES, gates_file)
-    first = register(outputs, gates_file)
+    _, first = registered_gates(outputs, gates_file)
     assert not first.changed and "unchanged" in str(first) and (outputs / RECORD).exists()
-    assert register(outputs, gates_file) == first
+    assert registered_gates(outputs, gates_file)[1] == first
     gates_file.write_text(gates_file.read_text().replace("decode: 0.95", "decode: 0.5"))
-    second = register(outputs, gates_file)
+    _, second = registered_gates(outputs, gates_file)
     assert second.changed and second.registered == first.digest != second.digest
     assert "CHANGED AFTER THE FACT" in str(second)
     gates_file.write_text("decode: high")
     with pytest.raises(UserError, match=r"^hardware.yaml.candidates: Field required"):
-        register(outputs, gates_file)
+        registered_gates(outputs, gates_file)
 
 
 # --- real frames

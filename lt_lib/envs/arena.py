@@ -100,11 +100,12 @@ def physics_xml(layout: Layout) -> str:
     slab = layout.slab(0)
     (cx, cy), (x0, x1, y0, y1) = slab.centre, slab.bounds
     centred = Box((x0 - cx, x1 - cx, y0 - cy, y1 - cy), layout.wall_height, "slab")
-    radius = layout.robot.radius
+    radius, friction = layout.robot.radius, layout.robot.friction
+    # sliding friction along the contact plane; torsion and rolling would brake a sphere that stands for a disc
     return f"""
 <mujoco>
   <option timestep="{1 / PHYSICS_HZ}" integrator="implicitfast" gravity="0 0 0"/>
-  <default><geom condim="1" contype="1" conaffinity="2"/></default>
+  <default><geom condim="3" friction="{friction} 0 0" contype="1" conaffinity="2"/></default>
   <worldbody>
     {walls}
     <body name="slab" mocap="true">{solid(centred)}</body>

@@ -6,7 +6,15 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    model_validator,
+)
 
 from lt_lib.settings.base import Settings, UserError, layout_path
 
@@ -61,8 +69,11 @@ class Corridors(Settings):
 
 
 class Robot(Settings):
+    """A disc, lengths in metres; friction is Coulomb's coefficient of its contact with walls and slab."""
+
     radius: PositiveFloat
     height: PositiveFloat
+    friction: NonNegativeFloat = 1.0
 
 
 class Camera(Settings):

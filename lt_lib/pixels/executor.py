@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -21,6 +21,7 @@ from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 from lt_lib.settings.pixels import ExecutorConfig
 from lt_lib.settings.streams import Stream
+from lt_lib.store.states import state_of
 
 ROUTES = 2
 FROM_SPAWN = 0.5  # share of pretraining episodes that start at the spawn
@@ -51,7 +52,7 @@ class FrozenExecutor:
 
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu"):
         self._policy = Executor().to(device).requires_grad_(False)
-        self._policy.load_state_dict({k: torch.tensor(v) for k, v in weights.items() if not k.startswith("curve.")})
+        self._policy.load_state_dict({name: torch.tensor(weights[name]) for name in self._policy.state_dict()})
 
     @torch.inference_mode()
     def mean_action(self, latent: Float[Tensor, "b 64"], route) -> Float[np.ndarray, "b 3"]:
@@ -78,11 +79,11 @@ class Driving:
         self.route, self._entered, self._age = np.zeros(n, np.int64), np.zeros(n, bool), np.zeros(n, np.int64)
         self._restart(np.ones(n, bool))
 
-    def observe(self) -> Float[Tensor, "n d"]:
-        arena = self._arena
-        return with_route(
-            self._encoder.latent(self._camera.frames(arena.pose, arena.slab, arena.scout[:, :2])), self.route
-        )
+    def observe(self, rows: Int[np.ndarray, " b"] | None = None) -> Float[Tensor, "b d"]:
+        """The observations of some rows, all by default."""
+        arena, rows = self._arena, np.arange(len(self.route)) if rows is None else rows
+        frames = self._camera.frames(arena.pose[rows], arena.slab[rows], arena.scout[rows, :2])
+        return with_route(self._encoder.latent(frames), self.route[rows])
 
     def step(self, action):
         """One control step; returns rewards, obedient, terminated, ended and the observation before any reset."""
@@ -131,6 +132,7 @@ def train_executor(
     """Pretrains the controller behind a frozen encoder; returns its weights and learning curves.
 
     "curve.*" have one entry per update: obedient share of the episodes that ended, their number, entropy.
+    "<look>.*" are the weights after each of `config.looks`.
     """
     rng = Stream.EXECUTOR.generator(seed)
     device = config.device
@@ -141,13 +143,16 @@ def train_executor(
     driving = Driving(load_layout(config.layout), FrozenEncoder(encoder, device, config.precision), config.envs, rng)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.lr, eps=1e-5)
     updates = max(1, config.steps // (config.rollout * config.envs))
-    curves = []
+    curves, kept = [], {}
     for i in range(updates):
         batch, ended, obedient = _collect(driving, policy, config, generator)
         statistics = ppo.update(policy, optimiser, batch, config.ppo, config.minibatch, rng)
         curves.append((obedient / max(ended, 1), ended, statistics.entropy))
+        taken = (i + 1) * config.rollout * config.envs  # control steps
+        if taken in config.looks:
+            kept |= state_of(policy, str(taken))
         report((i + 1) / updates)
-    weights = {k: v.cpu().numpy() for k, v in policy.state_dict().items()}
+    weights = {k: v.cpu().numpy() for k, v in policy.state_dict().items()} | kept
     names = ("obedient", "episodes", "entropy")
     return weights | {
         f"curve.{name}": np.array(c, np.float32) for name, c in zip(names, zip(*curves, strict=True), strict=True)
@@ -168,5 +173,9 @@ def _collect(driving: Driving, policy: Executor, config: ExecutorConfig, generat
         flags = (torch.from_numpy(a).to(mean.device) for a in (rewards.astype(np.float32), terminated, ended))
         steps.append(ppo.Step(observation, action, log_prob, value, following, *flags))
         ended_count, obedient_count = ended_count + ended.sum(), obedient_count + obedient.sum()
-        observation = driving.observe() if ended.any() else final
+        observation = final
+        if ended.any():
+            restarted = np.flatnonzero(ended)
+            places = torch.from_numpy(restarted).to(final.device)
+            observation = final.index_copy(0, places, driving.observe(restarted))
     return ppo.batch_of(steps, config.ppo), int(ended_count), int(obedient_count)

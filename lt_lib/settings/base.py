@@ -67,7 +67,6 @@ def layout_path(name: str) -> Path:
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
-Precision = Literal["float32", "bfloat16"]
 LATENCY = 1  # control steps from sending to arrival, as in the paper
 
 
@@ -89,6 +88,13 @@ class Training(Scene):
 
     decided = ("layout", "device")
     device: Literal["cpu", "cuda"] = "cpu"
+
+
+def require_looks(looks: Iterable[int], update: int, steps: int) -> None:
+    """Raises ValueError for a look that does not fall between two updates of a training, all in control steps."""
+    for look in looks:
+        if look % update or look > steps:
+            raise ValueError(f"looks: expected multiples of {update} up to {steps} control steps, got {look}")
 
 
 def everywhere(settings: Any, shared: Mapping[str, Any]) -> Any:

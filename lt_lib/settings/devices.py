@@ -1,8 +1,9 @@
-"""The device that a training computes on."""
+"""The device that a training computes on, and the precision of its frozen encoder."""
 
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import BeforeValidator
 
 from lt_lib.settings.base import UserError
 
@@ -13,3 +14,17 @@ def computing_device(name: Literal["auto", "cpu", "cuda"]) -> Literal["cpu", "cu
     if name == "cuda" and not available:
         raise UserError("device: cuda: torch finds no CUDA device here, only the CPU; expected cpu or auto")
     return "cuda" if available and name != "cpu" else "cpu"
+
+
+def computing_precision(name: Any) -> Any:
+    """The precision meant on this machine: 'auto' is bfloat16 where the CPU multiplies matrices of it, else float32.
+
+    On other CPUs bfloat16 is emulated, at half the speed of float32.
+    """
+    if name != "auto":
+        return name
+    return "bfloat16" if torch.cpu._is_amx_tile_supported() else "float32"
+
+
+# resolved when settings are read, so that a run's key names the precision that computed it
+Precision = Annotated[Literal["float32", "bfloat16"], BeforeValidator(computing_precision)]

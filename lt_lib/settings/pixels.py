@@ -2,7 +2,8 @@
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from lt_lib.settings.base import LATENCY, Precision, Settings, Share, Training
+from lt_lib.settings.base import LATENCY, Settings, Share, Training, require_looks
+from lt_lib.settings.devices import Precision
 from lt_lib.settings.perception import EncoderConfig, GateConfig, Gates
 from lt_lib.settings.ppo import PpoConfig
 
@@ -10,13 +11,20 @@ from lt_lib.settings.ppo import PpoConfig
 class ExecutorConfig(Training):
     """The low-level controller's pretraining (Section Implementation)."""
 
+    decided = (*Training.decided, "looks")
     steps: PositiveInt = 1_000_000
+    looks: tuple[PositiveInt, ...] = ()  # control steps after which the weights are kept too, whole updates each
     envs: PositiveInt = 64
     rollout: PositiveInt = 128  # control steps per environment and update
     minibatch: PositiveInt = 256
     lr: PositiveFloat = 2.5e-4
     ppo: PpoConfig = PpoConfig()
     precision: Precision = "float32"
+
+    @model_validator(mode="after")
+    def _looks_between_updates(self) -> "ExecutorConfig":
+        require_looks(self.looks, self.envs * self.rollout, self.steps)
+        return self
 
 
 class BankConfig(Training):

@@ -20,8 +20,8 @@ from lt_lib.settings.velocity import Configuration, NavigatorConfig, RolloutConf
 
 
 def profile_names(root: Path = ROOT) -> list[str]:
-    """The profiles of a project: every YAML file in params/ but the paper's claims."""
-    return sorted(path.stem for path in (root / "params").glob("*.yaml") if path.stem != "claims")
+    """The profiles of a project: every YAML file in params/ but those of the paper."""
+    return sorted(path.stem for path in (root / "params").glob("*.yaml") if path.stem not in ("claims", "inferred"))
 
 
 def notebook_names(root: Path = ROOT) -> list[str]:

@@ -11,8 +11,8 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 def state_of(module: nn.Module, prefix: str) -> dict[str, np.ndarray]:
-    """A module's weights as entries of a result."""
-    return {f"{prefix}.{name}": value.detach().cpu().numpy() for name, value in module.state_dict().items()}
+    """A module's weights as entries of a result, copied, since training goes on in place."""
+    return {f"{prefix}.{name}": value.detach().cpu().numpy().copy() for name, value in module.state_dict().items()}
 
 
 def restored(module: Module, result: Mapping[str, Any], prefix: str) -> Module:
@@ -25,3 +25,12 @@ def restored(module: Module, result: Mapping[str, Any], prefix: str) -> Module:
 def only(result: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     """A result's weights alone, for runs that do not depend on the course of training."""
     return {name: value for name, value in result.items() if name.startswith(f"{prefix}.")}
+
+
+def after(trained: Mapping[str, Any], look: int) -> dict[str, Any]:
+    """The weights that a training kept after so many control steps, one of its looks.
+
+    They equal those of a training that ends there, since nothing in it depends on its length.
+    """
+    prefix = f"{look}."
+    return {name.removeprefix(prefix): value for name, value in trained.items() if name.startswith(prefix)}

@@ -24,7 +24,7 @@ from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 from lt_lib.settings.streams import Stream
 from lt_lib.settings.velocity import Boost, NavigatorConfig
-from lt_lib.store.states import restored, state_of
+from lt_lib.store.states import after, restored, state_of
 from lt_lib.velocity.noise import Ar1
 
 WIRE = ANCHOR + CONTENT
@@ -87,10 +87,16 @@ class Scouts:
         sent = Sender(self._layout, self._encoder, frames, scout, np.zeros((len(scout), 2)), slab[which])
         self._held[torch.from_numpy(which)] = self._write(sent)
 
-    def wires(self, arena: Arena, age: Int[np.ndarray, " n"]) -> Float[Tensor, "n 66"]:
-        """Has every scout send, and returns what reaches the navigators; to be called at every step of an episode."""
-        self._channel.send(age, self._held, arena.scout[:, :2])
-        return self._channel.receive(age, arena.pose[:, :2])
+    def wires(
+        self, arena: Arena, age: Int[np.ndarray, " b"], rows: Int[np.ndarray, " b"] | None = None
+    ) -> Float[Tensor, "b 66"]:
+        """Has scouts send, and returns what reaches their navigators; to be called at every step of an episode.
+
+        rows  those that send, all by default
+        """
+        rows = np.arange(len(self._held)) if rows is None else rows
+        self._channel.send(age, self._held[rows], arena.scout[rows, :2], rows)
+        return self._channel.receive(age, arena.pose[rows, :2], rows)
 
 
 class Step(NamedTuple):
@@ -118,12 +124,15 @@ class Errand:
         self.finished: list[np.ndarray] = []
         self._restart(np.ones(n, bool))
 
-    def observe(self, boost: float) -> Float[Tensor, "n d"]:
-        arena = self._arena
-        latent = self._encoder.latent(self._camera.frames(arena.pose, arena.slab, arena.scout[:, :2])).cpu()
-        slab = F.one_hot(torch.from_numpy(arena.slab), len(SIDES)).float()
-        inside = torch.from_numpy(self.age < self._config.boost.window)[:, None]
-        return torch.cat([latent, self._scouts.wires(arena, self.age), 1 + (boost - 1) * inside, slab], dim=1)
+    def observe(self, boost: float, rows: Int[np.ndarray, " b"] | None = None) -> Float[Tensor, "b d"]:
+        """The observations of some rows, all by default."""
+        arena, rows = self._arena, np.arange(len(self.age)) if rows is None else rows
+        frames = self._camera.frames(arena.pose[rows], arena.slab[rows], arena.scout[rows, :2])
+        latent = self._encoder.latent(frames).cpu()
+        slab = F.one_hot(torch.from_numpy(arena.slab[rows]), len(SIDES)).float()
+        inside = torch.from_numpy(self.age[rows] < self._config.boost.window)[:, None]
+        wires = self._scouts.wires(arena, self.age[rows], rows)
+        return torch.cat([latent, wires, 1 + (boost - 1) * inside, slab], dim=1)
 
     def step(self, action: Float[np.ndarray, "n 3"], boost: float) -> Step:
         before = self._potential()
@@ -131,8 +140,9 @@ class Errand:
         self.age += 1
         arrived, touched, corridor = self._arena.reached, self._arena.contact, self._arena.corridor
         self._first = np.where(self._first == NO_CORRIDOR, corridor, self._first)
-        rewards = self._potential() - before + ARRIVED * arrived - self._config.hazard * touched
-        terminated = arrived | touched
+        config = self._config
+        rewards = self._potential() - before + ARRIVED * arrived - config.hazard * touched - config.step_cost
+        terminated = arrived | (touched & config.slab_ends)
         ended = terminated | (self.age >= TIME_LIMIT)
         following = self.observe(boost)
         told = ended & self._from_spawn
@@ -171,7 +181,7 @@ def train_navigator(
 ) -> dict:
     """Trains one navigator, from scratch or from where an earlier one (`start`) stood.
 
-    "navigator.*"      weights
+    "navigator.*"      weights; "<look>.navigator.*" those after each of `config.looks`
     "episodes" (E, 4)  every training episode from the spawn, in order: update, slab, first corridor (-1 none), arrived
     "sigma" (U, 3)     the policy's own standard deviations after every update
     "boost" (U,)       factor on the lateral one in the window
@@ -184,7 +194,7 @@ def train_navigator(
     chains = Ar1(np.full(config.envs, config.boost.tau), rng)
     optimiser = torch.optim.Adam(navigator.parameters(), lr=config.lr, eps=1e-5)
     updates = max(1, config.steps // (config.rollout * config.envs))
-    episodes, sigmas, boosts = [], [], []
+    episodes, sigmas, boosts, kept = [], [], [], {}
     for i in range(updates):
         boost = annealed(config.boost, i + 1)
         batch = _collect(errand, navigator, chains, config, boost, rng)
@@ -194,12 +204,21 @@ def train_navigator(
         errand.finished.clear()
         sigmas.append(navigator.log_std.detach().exp().numpy().copy())
         boosts.append(boost)
+        taken = (i + 1) * config.rollout * config.envs  # control steps
+        if taken in config.looks:
+            kept |= state_of(navigator, f"{taken}.navigator")
         report((i + 1) / updates)
-    return state_of(navigator, "navigator") | {
+    return state_of(navigator, "navigator") | kept | {
         "episodes": np.concatenate(episodes).astype(np.int64),
         "sigma": np.array(sigmas),
         "boost": np.array(boosts),
     }
+
+
+def stopped(trained: Mapping[str, np.ndarray], look: int, updates: int) -> dict[str, np.ndarray]:
+    """A training as it would have been, had it ended at one of its looks (control steps), after so many updates."""
+    course = {name: trained[name][:updates] for name in ("sigma", "boost")}
+    return after(trained, look) | course | {"episodes": trained["episodes"][trained["episodes"][:, 0] < updates]}
 
 
 def annealed(boost: Boost, iteration: int) -> float:
@@ -230,5 +249,8 @@ def _collect(
             following = navigator.value(step.following)
         flags = (torch.from_numpy(a) for a in (step.rewards.astype(np.float32), step.terminated, step.ended))
         steps.append(ppo.Step(observation, action, log_prob, value, following, *flags))
-        observation = errand.observe(boost) if step.ended.any() else step.following
+        observation = step.following
+        if step.ended.any():
+            restarted = np.flatnonzero(step.ended)
+            observation = observation.index_copy(0, torch.from_numpy(restarted), errand.observe(boost, restarted))
     return ppo.batch_of(steps, config.ppo)

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 
 from lt_lib.envs.layout import SIDES
 from lt_lib.pixels.protocol import PixelProtocol
-from lt_lib.settings.base import everywhere
+from lt_lib.settings.base import UserError, everywhere
 from lt_lib.settings.ppo import PpoConfig
 from lt_lib.settings.profiles import validated
-from lt_lib.settings.velocity import Boost, Exploration, NavigatorConfig, RolloutConfig
+from lt_lib.settings.velocity import Boost, Exploration, NavigatorConfig, PretrainingConfig, RolloutConfig
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
-from lt_lib.store.states import only
-from lt_lib.velocity.coverage import roll_navigator
-from lt_lib.velocity.navigator import train_navigator
+from lt_lib.store.states import after, only
+from lt_lib.velocity.coverage import TABLE_2, roll_navigator
+from lt_lib.velocity.judgements import commitment
+from lt_lib.velocity.navigator import stopped, train_navigator
 
-SEED = 0
 # What each of the six configurations changes; like the paper's, they vary hazard penalty, discount, curriculum, layout
 DIRECT: Mapping[str, dict[str, Any]] = MappingProxyType(
     {
@@ -32,15 +32,27 @@ DIRECT: Mapping[str, dict[str, Any]] = MappingProxyType(
         "wide layout": {"layout": "wide"},
     }
 )
-# The controls: the bit itself, no message, no choice of corridor, and the missing coverage supplied by hand
-OTHERS: Mapping[str, dict[str, Any]] = MappingProxyType(
+# Navigators that nobody tells anything, by where they learn to drive: whether the slab leaves them a choice of corridor,
+# and whether they also start in front of the mouths. The swept navigator of Table II is one of them
+CURRICULA: Mapping[str, dict[str, Any]] = MappingProxyType(
     {
-        "oracle": {"content": "oracle"},
-        "silent": {"content": "floor"},
-        "no choice": {"content": "floor", "blocked": "right"},
-        "shown both mouths": {"content": "oracle", "starts": "anywhere"},
+        "one corridor, past the mouths": {"content": "floor", "blocked": "right"},
+        "either corridor, past the mouths": {"content": "floor"},
+        "either corridor, anywhere": {"content": "floor", "starts": "anywhere"},
     }
 )
+# The controls: the bit itself, the missing coverage supplied by hand, no message, and no choice of corridor
+ORACLE, BOTH_MOUTHS = "oracle", "shown both mouths"
+SILENT = {"silent": "either corridor, past the mouths", "no choice": "one corridor, past the mouths"}
+# What might give the bit a use inside the corridor: contact that costs time instead of the episode, time that costs
+BITS: Mapping[str, dict[str, Any]] = MappingProxyType(
+    {
+        ORACLE: {"content": "oracle"},
+        "slab ends no episode": {"content": "oracle", "slab_ends": False},
+        "time costs": {"content": "oracle", "step_cost": 0.01},
+    }
+)
+FRICTIONS = MappingProxyType({0.0: "frictionless", 0.5: "half_friction"})  # and 1.0, the default layout's
 # The paper's boost is still 3.6 times the policy's own noise at iteration 80: a straight line that would reach 1 after
 # 160. A boost that is held can distinguish suppression from decay; one annealed run cannot
 BOOSTS = MappingProxyType(
@@ -59,7 +71,24 @@ class Examined(NamedTuple):
 
     spawn: dict[str, list[Result]]  # from the spawn, slab at random; row 0 actions sampled, row 1 without noise
     mouths: dict[str, list[list[Result]]]  # from in front of the left and the right mouth, that corridor free
-    flips: dict[tuple[str, bool], list[Result]]  # the oracle's, without noise, by blocked corridor and truth of the bit
+
+
+class Swept(NamedTuple):
+    """A frozen navigator under imposed noise, the slab in the corridor that it does not choose."""
+
+    incumbent: int  # the corridor that it enters first in most episodes, 0 left, 1 right
+    rows: Result  # of `roll_navigator`
+
+    @property
+    def alternative(self) -> int:
+        return 1 - self.incumbent
+
+
+class Bit(NamedTuple):
+    """A frozen navigator told the oracle's bit, without noise."""
+
+    incumbent: int
+    flips: dict[tuple[str, bool], Result]  # by blocked corridor and truth of the bit
 
 
 @dataclass(frozen=True)
@@ -70,35 +99,68 @@ class DirectTransfer:
     encoder: Result
     navigator: NavigatorConfig
     rollout: RolloutConfig
+    pretraining: PretrainingConfig
 
     @classmethod
-    def of(cls, protocol: PixelProtocol, navigator: Mapping[str, Any], rollout: Mapping[str, Any]) -> "DirectTransfer":
+    def of(
+        cls,
+        protocol: PixelProtocol,
+        navigator: Mapping[str, Any],
+        rollout: Mapping[str, Any],
+        pretraining: Mapping[str, Any],
+    ) -> "DirectTransfer":
         """Builds the study from a notebook's parameters.
 
-        navigator, rollout  dicts of the fields of NavigatorConfig and RolloutConfig, as in a profile
+        navigator, rollout, pretraining  dicts of the fields of NavigatorConfig, RolloutConfig and PretrainingConfig, as
+                                         in a profile
 
-        Raises GateError if the encoder fails its freeze gates.
+        Raises UserError for looks that the trainings cannot take, GateError if the encoder fails its freeze gates.
         """
-        given = validated(NavigatorConfig, "navigator", navigator), validated(RolloutConfig, "rollout", rollout)
+        kinds = {"navigator": NavigatorConfig, "rollout": RolloutConfig, "pretraining": PretrainingConfig}
+        given = {"navigator": navigator, "rollout": rollout, "pretraining": pretraining}
+        checked = {name: validated(kind, name, given[name]) for name, kind in kinds.items()}
+        _require_looks(checked["navigator"], checked["pretraining"])
         shared = {name: getattr(protocol.sizes.head, name) for name in ("layout", "device", "latency")}
-        return cls(protocol.store, protocol.encoder_weights(), *(everywhere(each, shared) for each in given))
+        return cls(protocol.store, protocol.encoder_weights(), *(everywhere(each, shared) for each in checked.values()))
 
-    def navigators(self, configurations: Sequence[str], oracle_seeds: int) -> dict[str, list[Result]]:
-        """Trains all navigators from scratch; returns them by name: `oracle_seeds` of the oracle, one of each other."""
-        runs = {
-            (name, seed): Run(train_navigator, self._config(name), seed, {"encoder": self.encoder})
-            for name in (*configurations, *OTHERS)
-            for seed in range(oracle_seeds if name == "oracle" else 1)
+    def pretrained(self) -> dict[str, list[Result]]:
+        """Silent navigators of every curriculum, `pretraining.seeds` each, with their weights at every look."""
+        looks, seeds = self.pretraining.looks, self.pretraining.seeds
+        changes = {name: CURRICULA[name] | {"steps": looks[-1], "looks": looks} for name in CURRICULA}
+        return self._trained(changes, dict.fromkeys(CURRICULA, seeds), "pretrained navigators")
+
+    def navigators(
+        self, configurations: Sequence[str], pretrained: Mapping[str, list[Result]], oracle: Sequence[Result]
+    ) -> dict[str, list[Result]]:
+        """Every navigator of the null result after `navigator.steps` control steps, by name.
+
+        pretrained  of `pretrained`: the first seeds of two curricula are the controls SILENT
+        oracle      the oracle's trainings of `told`
+        """
+        changes = {name: {"content": "latent"} | DIRECT[name] for name in configurations}
+        changes |= {BOTH_MOUTHS: {"content": "oracle", "starts": "anywhere"}}
+        trained = self._trained(changes, dict.fromkeys(changes, 1), "navigators")
+        silent = {name: [self._stopped(pretrained[curriculum][0])] for name, curriculum in SILENT.items()}
+        return {
+            **{name: trained[name] for name in configurations},
+            ORACLE: [self._stopped(each) for each in oracle],
+            **silent,
+            BOTH_MOUTHS: trained[BOTH_MOUTHS],
         }
-        results = dict(zip(runs, self.store.fetch(list(runs.values()), "navigators"), strict=True))
-        return {name: [results[key] for key in runs if key[0] == name] for name, _ in runs}
 
-    def _config(self, name: str) -> NavigatorConfig:
-        changes = {"content": "latent"} | DIRECT[name] if name in DIRECT else OTHERS[name]
-        return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | changes))
+    def told(self, seeds: int) -> dict[str, list[Result]]:
+        """Navigators told the oracle's bit, by what else is changed (BITS), with their weights at every look."""
+        looks = self.bit_looks
+        changes = {name: BITS[name] | {"steps": looks[-1], "looks": looks} for name in BITS}
+        return self._trained(changes, dict.fromkeys(BITS, seeds), "navigators that are told the bit")
+
+    @property
+    def bit_looks(self) -> tuple[int, ...]:
+        """Control steps after which the use of the bit is measured; `navigator.steps` is one of them."""
+        return tuple(sorted({*self.pretraining.bit_looks, self.navigator.steps}))
 
     def examined(self, navigators: Mapping[str, list[Result]]) -> Examined:
-        """Plays the frozen navigators from the spawn, from in front of either mouth, and with the oracle's bit flipped.
+        """Plays the frozen navigators from the spawn, and from in front of either mouth.
 
         From the spawn, each navigator gets its own random draws of the scene; in all other cases all get the same.
         """
@@ -109,40 +171,127 @@ class DirectTransfer:
             for n, r in everyone
             for side, other in (SIDES, SIDES[::-1])
         ]
-        cases = [(side, true) for side in SIDES for true in (True, False)]
-        configs = [self._rollout("oracle", rows=(GREEDY,), blocked=side, truthful=true) for side, true in cases]
-        flipped = [self._roll(config, navigator) for config in configs for navigator in navigators["oracle"]]
-        results = iter(self.store.fetch([*spawn, *mouths, *flipped], "frozen navigators"))
+        results = iter(self.store.fetch([*spawn, *mouths], "frozen navigators"))
         return Examined(
             {name: [next(results) for _ in trained] for name, trained in navigators.items()},
             {name: [[next(results) for _ in SIDES] for _ in trained] for name, trained in navigators.items()},
-            {case: [next(results) for _ in navigators["oracle"]] for case in cases},
         )
 
-    def explored(
-        self, navigator: Result, blocked: str, groups: Sequence[tuple[Exploration, ...]]
-    ) -> tuple[list[Result], dict[str, Result]]:
-        """Sweeps a navigator that was trained without a message, and trains it further with the bit.
+    def swept(
+        self, trained: Sequence[Result], rows: Sequence[Exploration], episodes: int, layout: str = ""
+    ) -> list[Swept]:
+        """Plays frozen silent navigators of seeds 0, 1, ... under each row of noise.
 
-        navigator  a result of `train_navigator`
-        blocked    the slab's corridor throughout the sweep
-        groups     rows of the sweep, one run per group
+        The slab stands in the corridor that a navigator does not choose, which is found first, from the spawn.
 
-        Returns one result of `roll_navigator` per group, and the further trainings by the name of their boost.
+        layout  another scene than the study's
         """
-        swept = [self._roll(self._rollout("no choice", rows=rows, blocked=blocked), navigator) for rows in groups]
-        inputs = {"encoder": self.encoder, "start": only(navigator, "navigator")}
-        boosted = [
-            Run(train_navigator, self._config("oracle").model_copy(update={"boost": boost}), SEED, inputs)
-            for boost in BOOSTS.values()
+        shared = {"episodes": episodes} | ({"layout": layout} if layout else {})
+        chosen = [self._roll(self._silent(rows=(SAMPLED,), **shared), r, seed) for seed, r in enumerate(trained)]
+        incumbents = [commitment(result)[0] for result in self.store.fetch(chosen, "incumbent corridors")]
+        runs = [
+            self._roll(self._silent(rows=tuple(rows), blocked=SIDES[1 - incumbent], **shared), r, seed)
+            for seed, (incumbent, r) in enumerate(zip(incumbents, trained, strict=True))
         ]
-        results = self.store.fetch([*swept, *boosted], "coverage sweep and boosted trainings")
-        return results[: len(swept)], dict(zip(BOOSTS, results[len(swept) :], strict=True))
+        return list(map(Swept, incumbents, self.store.fetch(runs, "coverage sweep")))
+
+    def at_looks(self, trained: Sequence[Result]) -> dict[int, list[Swept]]:
+        """Table II after every look of the pretraining, with fewer episodes per row; one navigator per seed."""
+        episodes = self.pretraining.episodes
+        return {
+            look: self.swept([after(each, look) for each in trained], tuple(TABLE_2.values()), episodes)
+            for look in self.pretraining.looks
+        }
+
+    def slippery(self) -> dict[float, list[Swept]]:
+        """Table II with other frictions of walls and slab, in training and in the sweep; one navigator per seed."""
+        curriculum = CURRICULA[self.pretraining.curriculum]
+        changes = {layout: curriculum | {"layout": layout} for layout in FRICTIONS.values()}
+        trained = self._trained(changes, dict.fromkeys(changes, self.pretraining.seeds), "navigators by friction")
+        rows = tuple(TABLE_2.values())
+        return {
+            friction: self.swept(trained[layout], rows, self.pretraining.episodes, layout)
+            for friction, layout in FRICTIONS.items()
+        }
+
+    def boosted(self, starts: Sequence[Result]) -> dict[str, list[Result]]:
+        """Trains silent navigators further with the bit: all with the annealed boost, the first with each other one."""
+        runs = {
+            (name, seed): Run(
+                train_navigator,
+                self._config({"content": "oracle", "boost": boost, "steps": self._boosted_steps}),
+                seed,
+                {"encoder": self.encoder, "start": only(start, "navigator")},
+            )
+            for name, boost in BOOSTS.items()
+            for seed, start in enumerate(starts if name == "annealed" else starts[:1])
+        }
+        return self._by_name(runs, "boosted trainings")
+
+    @property
+    def _boosted_steps(self) -> int:
+        return self.pretraining.boosted * self.navigator.envs * self.navigator.rollout
+
+    def flipped(self, trained: Sequence[Result], episodes: int) -> list[Bit]:
+        """Plays frozen navigators that are told the bit under both placements, with the true bit and with its opposite.
+
+        Without noise. All navigators get the same draws of the scene.
+        """
+        shared = {"content": "oracle", "episodes": episodes}
+        spawn = [self._roll(self._configured(rows=(GREEDY,), **shared), r, seed) for seed, r in enumerate(trained)]
+        incumbents = [commitment(result)[0] for result in self.store.fetch(spawn, "incumbent corridors")]
+        cases = [(side, true) for side in SIDES for true in (True, False)]
+        configs = [self._configured(rows=(GREEDY,), blocked=side, truthful=true, **shared) for side, true in cases]
+        runs = [self._roll(config, r) for r in trained for config in configs]
+        results = iter(self.store.fetch(runs, "flipped bits"))
+        return [Bit(incumbent, {case: next(results) for case in cases}) for incumbent in incumbents]
+
+    def _trained(
+        self, changes: Mapping[str, Mapping[str, Any]], seeds: Mapping[str, int], what: str
+    ) -> dict[str, list[Result]]:
+        runs = {
+            (name, seed): Run(train_navigator, self._config(change), seed, {"encoder": self.encoder})
+            for name, change in changes.items()
+            for seed in range(seeds[name])
+        }
+        return self._by_name(runs, what)
+
+    def _by_name(self, runs: Mapping[tuple[str, int], Run], what: str) -> dict[str, list[Result]]:
+        results: dict[str, list[Result]] = {}
+        for (name, _), result in zip(runs, self.store.fetch(list(runs.values()), what), strict=True):
+            results.setdefault(name, []).append(result)
+        return results
+
+    def _stopped(self, trained: Result) -> Result:
+        steps = self.navigator.steps
+        return stopped(trained, steps, steps // (self.navigator.envs * self.navigator.rollout))
+
+    def _config(self, change: Mapping[str, Any]) -> NavigatorConfig:
+        return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | dict(change)))
 
     def _rollout(self, name: str, **changes: Any) -> RolloutConfig:
-        trained = self._config(name)
-        shared = {key: getattr(trained, key) for key in ("layout", "device", "content", "latency", "precision")}
+        """Episodes of a navigator of the null result, in the scene and with the content that it was trained with."""
+        content = {ORACLE: "oracle", BOTH_MOUTHS: "oracle"} | dict.fromkeys(SILENT, "floor")
+        layout = {"layout": DIRECT[name]["layout"]} if "layout" in DIRECT.get(name, {}) else {}
+        return self._configured(content=content.get(name, "latent"), **layout, **changes)
+
+    def _silent(self, **changes: Any) -> RolloutConfig:
+        return self._configured(content="floor", **changes)
+
+    def _configured(self, **changes: Any) -> RolloutConfig:
+        shared = {key: getattr(self.navigator, key) for key in ("layout", "device", "latency", "precision")}
         return self.rollout.model_copy(update=shared | changes)
 
-    def _roll(self, config: RolloutConfig, navigator: Result, seed: int = SEED) -> Run:
+    def _roll(self, config: RolloutConfig, navigator: Result, seed: int = 0) -> Run:
         return Run(roll_navigator, config, seed, {"encoder": self.encoder, "navigator": only(navigator, "navigator")})
+
+
+def _require_looks(navigator: NavigatorConfig, pretraining: PretrainingConfig) -> None:
+    """Raises UserError unless the trainings end with an update at every look, and `navigator.steps` is one."""
+    update = navigator.envs * navigator.rollout
+    if navigator.steps not in pretraining.looks:
+        raise UserError(f"navigator.steps: must be one of pretraining.looks {pretraining.looks}, got {navigator.steps}")
+    for name in ("looks", "bit_looks"):
+        for look in getattr(pretraining, name):
+            if look % update:
+                raise UserError(f"pretraining.{name}: expected multiples of {update} control steps, got {look}")

@@ -1,0 +1,80 @@
+"""Settings that the paper does not print, inferred from rows set aside for it (params/inferred.yaml)."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from lt_lib.report.registration import Registration, register
+from lt_lib.settings.base import ROOT, Settings, UserError, read_yaml
+from lt_lib.settings.profiles import explain
+
+INFERRED = ROOT / "params" / "inferred.yaml"
+RECORD = "inferred.json"
+
+
+class Inferred(Settings):
+    """One entry of inferred.yaml; the head of that file explains every field."""
+
+    setting: str
+    what: str
+    tried: Annotated[tuple[Any, ...], Field(min_length=2)] | dict[str, tuple[Any, ...]]
+    calibrates: tuple[str, ...]
+    measure: str
+    target: Annotated[tuple[float, ...], Field(min_length=1)]
+    rule: Literal["nearest", "largest"]
+    predicts: Annotated[tuple[str, ...], Field(min_length=1)]
+
+    def choose(self, measured: Mapping[Any, float | Sequence[float]]) -> Any:
+        """The value that the rule picks from what was measured for each value tried; the first of equals.
+
+        Raises ValueError for a measure of another shape than the target.
+        """
+        values = list(measured)
+        numbers = np.array([np.atleast_1d(measured[value]) for value in values], float)  # (values, targets)
+        if numbers.shape[1:] != (len(self.target),):
+            raise ValueError(f"{self.setting}: expected {len(self.target)} numbers per value, got {numbers.shape[1:]}")
+        if self.rule == "largest":
+            return values[int(numbers.sum(axis=1).argmax())]
+        return values[int(np.abs(numbers - self.target).sum(axis=1).argmin())]
+
+
+class Choice(NamedTuple):
+    """What the rule picks, beside the value in use."""
+
+    picked: Any
+    used: Any
+
+    def __str__(self) -> str:
+        if self.picked == self.used:
+            return f"the rule picks {self.picked}, the value in use"
+        return f"here the rule picks {self.picked}; {self.used} is in use"
+
+
+def load_inferred(path: Path = INFERRED) -> dict[str, Inferred]:
+    """Every inferred setting by where its value stands. Raises a one-line UserError for an unreadable file or entry."""
+    entries = read_yaml(path)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise UserError(f"{path.name}: expected a list of entries '- {{setting: ..., what: ..., ...}}'")
+    settings: dict[str, Inferred] = {}
+    for entry in entries:
+        try:
+            setting = Inferred.model_validate(entry)
+        except ValidationError as error:
+            raise UserError(explain(error, f"{path.name}: {entry.get('setting')}", Inferred)) from None
+        if setting.setting in settings:
+            raise UserError(f"{path.name}: {setting.setting} appears twice")
+        settings[setting.setting] = setting
+    return settings
+
+
+def calibrating_rows(path: Path = INFERRED) -> dict[str, str]:
+    """The setting that each calibrating row gave, by the row's id."""
+    return {row: name for name, setting in load_inferred(path).items() for row in setting.calibrates}
+
+
+def registered(outputs: Path) -> Registration:
+    """The checksum of inferred.yaml at its first use in an outputs folder, and now."""
+    return register("inferred settings", INFERRED, Path(outputs) / RECORD)

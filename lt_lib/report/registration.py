@@ -1,0 +1,49 @@
+"""Files that were written down before the results, and the proof that nobody changed them afterwards."""
+
+import hashlib
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+from lt_lib.settings.base import UserError
+from lt_lib.store.files import write_atomically
+
+
+class Registration(NamedTuple):
+    """The checksum of a file as it stands, and as it was registered at the first use."""
+
+    what: str
+    digest: str  # sha256 of the file as it stands
+    registered: str  # sha256 at the first use
+    first_use: str  # when that was, UTC
+
+    @property
+    def changed(self) -> bool:
+        return self.digest != self.registered
+
+    def __str__(self) -> str:
+        if self.changed:
+            return (
+                f"CHANGED AFTER THE FACT: the {self.what} were registered on {self.first_use} with sha256 "
+                f"{self.registered[:12]}, the file now has {self.digest[:12]}; nothing below counts as pre-registered"
+            )
+        return f"{self.what} registered on {self.first_use}, sha256 {self.digest[:12]}, unchanged since"
+
+
+def register(what: str, path: Path, record: Path) -> Registration:
+    """The first time, leaves a file's checksum in `record`; later, compares with it.
+
+    what  the file's content in a word or two, plural
+
+    Raises a one-line UserError for a record that cannot be read.
+    """
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if not record.exists():
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        write_atomically(record, (json.dumps({"sha256": digest, "first_use": now}, indent=1) + "\n").encode())
+    try:
+        earlier = json.loads(record.read_text(encoding="utf-8"))
+        return Registration(what, digest, earlier["sha256"], earlier["first_use"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{record}: not a record of registered {what} ({error!r})") from None
