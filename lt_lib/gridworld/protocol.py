@@ -8,6 +8,7 @@ from lt_lib.gridworld.episodes import evaluate_grid
 from lt_lib.gridworld.mappo import train_grid
 from lt_lib.gridworld.patch_gates import measure_patch_gates, require_patch_gates
 from lt_lib.gridworld.patches import train_patch_encoder
+from lt_lib.gridworld.views import rescaled
 from lt_lib.gridworld.wires import GRID_CONTENTS
 from lt_lib.settings.base import everywhere, require_known
 from lt_lib.settings.gridworld import (
@@ -17,6 +18,7 @@ from lt_lib.settings.gridworld import (
     PatchEncoderConfig,
     PatchGateConfig,
     PatchGates,
+    Scaled,
 )
 from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
@@ -36,6 +38,7 @@ class GridProtocol:
     encoder: PatchEncoderConfig
     gates: PatchGates
     grid: GridConfig
+    scaled: Scaled = "each"
 
     @classmethod
     def of(cls, gridworld: Mapping, workers: int | str) -> "GridProtocol":
@@ -43,7 +46,7 @@ class GridProtocol:
         section = validated(GridworldConfig, "gridworld", dict(gridworld))
         there = {"layout": section.layout, "latency": section.latency}
         encoder, policy = (everywhere(each, there) for each in (section.encoder, section.policy))
-        return cls(RunStore(runs_folder(), workers), encoder, section.gates, policy)
+        return cls(RunStore(runs_folder(), workers), encoder, section.gates, policy, section.scaled)
 
     def encoders(self) -> dict[str, Result]:
         """Ours, the ablation of the auxiliary that the paper calls necessary, and what ours must beat at the gates."""
@@ -87,7 +90,7 @@ class GridProtocol:
         """Stage 2 with settings that the paper's rows share changed: so many seeds of each, by name."""
         runs = {
             (name, seed): Run(
-                train_grid, self.grid.model_copy(update=dict(change)), seed, {"encoder": _frozen(encoder)}
+                train_grid, self.grid.model_copy(update=dict(change)), seed, {"encoder": self.frozen(encoder)}
             )
             for name, change in changes.items()
             for seed in range(seeds)
@@ -97,7 +100,7 @@ class GridProtocol:
 
     def _fetch(self, wanted: Mapping[str, tuple[str, int, Result]]) -> dict[str, list[Result]]:
         runs = {
-            (name, seed): Run(train_grid, self._trained_on(content), seed, {"encoder": _frozen(encoder)})
+            (name, seed): Run(train_grid, self._trained_on(content), seed, {"encoder": self.frozen(encoder)})
             for name, (content, count, encoder) in wanted.items()
             for seed in range(count)
         }
@@ -114,7 +117,7 @@ class GridProtocol:
                 evaluate_grid,
                 GridEvaluationConfig(content=content, wire=wire, episodes=episodes, **shared),
                 seed,
-                {"policy": only(policy, "actor"), "encoder": _frozen(encoder)},
+                {"policy": only(policy, "actor"), "encoder": self.frozen(encoder)},
             )
             for content, trained in policies.items()
             for seed, policy in enumerate(trained)
@@ -129,7 +132,7 @@ class GridProtocol:
     def _trained_on(self, content: str) -> GridConfig:
         return self.grid.model_copy(update={"content": content})
 
-
-def _frozen(encoder: Result) -> Result:
-    """Weights and normalisation alone: how the training went does not concern those who use it."""
-    return {name: value for name, value in encoder.items() if not name.startswith("loss.")}
+    def frozen(self, encoder: Result) -> Result:
+        """Weights, and the latent's normalisation as policies get it: how the training went does not concern them."""
+        weights = {name: value for name, value in encoder.items() if not name.startswith("loss.")}
+        return dict(rescaled(weights, self.scaled))

@@ -16,6 +16,7 @@ from lt_lib.gridworld.map import Grid
 from lt_lib.gridworld.patches import FrozenPatchEncoder
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.settings.base import UserError
+from lt_lib.settings.gridworld import Scaled
 
 
 class Views(NamedTuple):
@@ -45,6 +46,18 @@ def pixels(grid: Grid, weights: Mapping[str, np.ndarray]) -> Views:
             raise UserError(f"layout {layout.name}: the slab shows in the frame at ({point.x}, {point.y}) m")
     posts = _frames(grid, grid.posts, layout.scout.array[2], layout.spawn.array[:2])
     return Views(FrozenEncoder(weights), own, posts)
+
+
+def rescaled(weights: Mapping[str, np.ndarray], scaled: Scaled) -> Mapping[str, np.ndarray]:
+    """Frozen weights with another normalisation of the latent than that fixed at the freeze, every dimension's own."""
+    mean, std = weights["mean"], weights["std"]
+    match scaled:
+        case "each":
+            return weights
+        case "one":
+            return {**weights, "std": np.full_like(std, np.sqrt(np.mean(std**2)))}
+        case "none":
+            return {**weights, "mean": np.zeros_like(mean), "std": np.ones_like(std)}
 
 
 VIEWS = {"cells": cells, "pixels": pixels}

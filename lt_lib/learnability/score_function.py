@@ -194,6 +194,7 @@ def train_point_mass(config: PointMassConfig, seed: int, *, report: Callable[[fl
     arm, stack, baseline = ARMS[config.arm], Stack.of(config, seed), BASELINES[config.baseline]
     policy = np.zeros((len(stack.d), 2))
     optimiser = OPTIMISERS[config.optimiser](config.lr, policy.shape)
+    steps = stack.window if config.score == "mean" else 1
     generators = stack.generators(config.arm, 0)
     kept, coverage = [], []
     for done in range(UPDATES_PER_LOOK, config.budgets[-1] + 1, UPDATES_PER_LOOK):
@@ -202,7 +203,7 @@ def train_point_mass(config: PointMassConfig, seed: int, *, report: Callable[[fl
             entered, score = play(arm, stack, policy, episodes)
             rewards = reward(entered, episodes.safe)
             advantage = rewards - baseline(episodes.message, rewards)
-            policy = policy + optimiser.step(gradient(episodes.message, score, advantage))
+            policy = policy + optimiser.step(gradient(episodes.message, score / steps, advantage))
             shares.append(entered.mean(1))
         coverage.append(np.mean(shares, axis=0))
         if done in config.budgets:

@@ -4,7 +4,7 @@ Everything but the message is held fixed: one frozen encoder, one frozen executo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +125,11 @@ class PixelProtocol:
         }
         return self._by_name(runs, "route heads")
 
+    def with_minibatch(self, minibatch: int) -> "PixelProtocol":
+        """The same protocol with another minibatch of the route head, episodes."""
+        head = self.sizes.head.model_copy(update={"minibatch": minibatch})
+        return replace(self, sizes=self.sizes.model_copy(update={"head": head}))
+
     def without_anchor(self, seeds: int, bank: Result, encoder: Result) -> list[Result]:
         """Heads that get the latent without its anchor, which the paper calls spatially unusable."""
         config = self._head("latent").model_copy(update={"wire": "anchor_zeroed"})
@@ -177,7 +182,9 @@ class PixelProtocol:
 
     def _redrawn(self, name: str) -> RedrawConfig:
         row = REDRAWS[name]
-        return self.sizes.redraw.model_copy(update={"content": row.content, "every": row.every, "credit": row.credit})
+        same = {key: getattr(self.sizes.head, key) for key in ("minibatch", "lr")}
+        varied = {"content": row.content, "every": row.every, "credit": row.credit}
+        return self.sizes.redraw.model_copy(update=same | varied)
 
 
 def obedience(bank: Result) -> float:

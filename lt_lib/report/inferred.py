@@ -20,7 +20,7 @@ class Inferred(Settings):
 
     setting: str
     what: str
-    tried: Annotated[tuple[Any, ...], Field(min_length=2)] | dict[str, tuple[Any, ...]]
+    tried: Annotated[tuple[Any, ...], Field(min_length=2)] | dict[str, list[Any]]
     calibrates: tuple[str, ...]
     measure: str
     target: Annotated[tuple[float, ...], Field(min_length=1)]

@@ -117,6 +117,29 @@ def equivalence(outcomes: Outcomes, reference: Outcomes | float, margin: float) 
     return float(stats.t.sf((margin - gap) / np.sqrt(total), total**2 / (variances**2 / freedom).sum()))
 
 
+def mean_above(outcomes: Outcomes, share: float) -> float:
+    """One-sided p that a mean over seeds is greater than `share`: Student's t, exact binomial for a single seed."""
+    if len(outcomes) == 1:
+        return above(int(outcomes.sum()), outcomes.size, share)
+    return float(stats.t.sf((outcomes.mean() - share) / standard_error(outcomes), len(outcomes) - 1))
+
+
+def mean_below(outcomes: Outcomes, share: float) -> float:
+    """One-sided p that a mean over seeds is smaller than `share`."""
+    return mean_above(1 - outcomes.astype(int), 1 - share)
+
+
+def mean_less(one: Outcomes, other: Outcomes) -> float:
+    """One-sided p that the first mean over seeds is the smaller: Welch's t, Fisher's exact test for single seeds."""
+    if max(len(one), len(other)) == 1:
+        return fewer(*((int(side.sum()), side.size) for side in (one, other)))
+    variances = np.array([standard_error(side) ** 2 for side in (one, other)])
+    freedom = np.maximum([len(one) - 1, len(other) - 1], 1)
+    total = variances.sum()
+    gap = float(other.mean() - one.mean())
+    return float(stats.t.sf(gap / np.sqrt(total), total**2 / (variances**2 / freedom).sum()))
+
+
 def drop_test(intact_successes: SupportsIndex, corrupted_successes: SupportsIndex, n: SupportsIndex) -> float:
     """One-sided Fisher exact p that corruption lowers a head's success, n episodes per cell (Table IV)."""
     return fewer((corrupted_successes, n), (intact_successes, n))

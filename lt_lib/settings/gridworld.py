@@ -8,6 +8,9 @@ from lt_lib.settings.base import LATENCY, Scene, Settings, Share
 from lt_lib.settings.perception import ObjectiveConfig
 from lt_lib.settings.ppo import PpoConfig
 
+# How a frozen latent enters the policy: every dimension standardised, all by one standard deviation, or as it comes
+Scaled = Literal["each", "one", "none"]
+
 
 class PatchEncoderConfig(ObjectiveConfig):
     """Stage 1 in the gridworld, which has about a hundred views; the pixel scene has unlimited ones."""
@@ -67,4 +70,5 @@ class GridworldConfig(Settings):
     encoder: PatchEncoderConfig = PatchEncoderConfig()
     gates: PatchGates = PatchGates()
     policy: GridConfig = GridConfig()
+    scaled: Scaled = "each"
     seeds: dict[str, PositiveInt]  # number per content

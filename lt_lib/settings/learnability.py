@@ -22,6 +22,7 @@ class PointMassConfig(Settings):
     seeds: PositiveInt = 5
     optimiser: Literal["adam", "sgd"] = "adam"
     baseline: Literal["batch", "message"] = "batch"  # mean reward of the batch, or of its episodes with this message
+    score: Literal["sum", "mean"] = "sum"  # of a window: over its steps
     lr: PositiveFloat = 0.02
     batch: Annotated[int, Field(ge=2)] = 128  # episodes per update
     budgets: Annotated[tuple[Budget, ...], Field(min_length=1)] = (

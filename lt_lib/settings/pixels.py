@@ -50,7 +50,7 @@ class HeadConfig(Training):
     latency: NonNegativeInt = LATENCY  # control steps
     episodes: PositiveInt = 6_000
     batch: PositiveInt = 256
-    minibatch: PositiveInt = 64
+    minibatch: PositiveInt = 64  # episodes
     lr: PositiveFloat = 3e-3
     ppo: PpoConfig = PpoConfig()
 
@@ -68,14 +68,14 @@ class EvaluationConfig(Training):
 class RedrawConfig(Training):
     """The route head trained live, its route redrawn every `every` control steps (lower block of Table III)."""
 
-    decided = (*Training.decided, "content", "every", "credit", "latency")
+    decided = (*Training.decided, "content", "every", "credit", "latency", "minibatch", "lr")
     content: str = "latent"  # a name in comm.messages.CONTENTS
     latency: NonNegativeInt = LATENCY  # control steps
     every: NonNegativeInt = 0  # control steps between draws, the paper's k; 0: one draw per episode
     credit: str = "episode"  # a name in pixels.redraw.CREDITS
     episodes: PositiveInt = 6_000
     batch: PositiveInt = 256  # episodes
-    minibatch: PositiveInt = 64  # episodes' worth of draws
+    minibatch: PositiveInt = 64  # episodes' worth of draws; this and the rate are those of `HeadConfig`
     lr: PositiveFloat = 3e-3
     ppo: PpoConfig = PpoConfig()
     envs: PositiveInt = 64

@@ -16,7 +16,7 @@ from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, Ra
 from lt_lib.settings.learnability import Budget, PointMassConfig
 from lt_lib.settings.pixels import ExecutorConfig, PixelsConfig
 from lt_lib.settings.speed import Stretch
-from lt_lib.settings.velocity import Configuration, NavigatorConfig, RolloutConfig
+from lt_lib.settings.velocity import Configuration, NavigatorConfig, PretrainingConfig, RolloutConfig
 
 
 def profile_names(root: Path = ROOT) -> list[str]:
@@ -167,6 +167,7 @@ SECTIONS: dict[str, Any] = {
     "timed_updates": Budget,
     "navigator": NavigatorConfig,
     "rollout": RolloutConfig,
+    "pretraining": PretrainingConfig,
     "oracle_seeds": PositiveInt,
     "configurations": Annotated[list[Configuration], Field(min_length=1)],
     "sigmas": Annotated[list[PositiveFloat], Field(min_length=1)],
@@ -175,6 +176,8 @@ SECTIONS: dict[str, Any] = {
     "stretch": Stretch,
     "seeds": dict[str, PositiveInt],
     "more_seeds": PositiveInt,
+    "minibatches": Annotated[list[PositiveInt], Field(min_length=2)],
+    "tried_seeds": dict[str, PositiveInt],
     "latent_heads": PositiveInt,
     "episodes": PositiveInt,
     "matched": MatchedEncoderConfig,

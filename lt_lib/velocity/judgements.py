@@ -22,6 +22,7 @@ RARE = 0.05  # coverage up to which exploration counts as not reaching the decis
 COMPETENT = 0.5  # success above which a navigator counts as competent, and below which as collapsed
 PROBED = 0.95  # accuracy of a probe that recovers the hazard
 EXACT = 0.01  # share of full speed by which a command may be missed
+PRINTED = 0.005  # the smallest share that does not print as 0.00
 COMMITTED = 0.95  # smallest share of one corridor, under either placement, that counts as commitment to it
 EXACT_UP_TO = 8  # pairs up to which the rank test enumerates every order
 
@@ -85,10 +86,10 @@ def one_committed(first: Int[np.ndarray, "1 episodes"], slab: Int[np.ndarray, "1
     return found | {key: found[key][0] for key in ("value", "low", "high")} | {"seeds": None, "n": first.size}
 
 
-def held_near(across: Float[np.ndarray, " episodes"], *, d: float) -> dict[str, Any]:
+def held_near(across: Float[np.ndarray, "seeds episodes"], *, d: float) -> dict[str, Any]:
     """Whether the mean sideways command held is near d: within a fifth of it, so that the other side is near 2 d."""
-    p = stats.equivalence(across[:, None], d, 0.2 * d)
-    test = f"equivalence of the held command {across.mean():.2f} with d = {d:.2f} ± a fifth (TOST over episodes)"
+    p = stats.equivalence(across, d, 0.2 * d)
+    test = f"equivalence of the held command {across.mean():.2f} with d = {d:.2f} ± a fifth (TOST)"
     return judges.words(p < ALPHA, test, p=p, n=len(across))
 
 
@@ -114,35 +115,19 @@ def probe_recovers(right: Bool[np.ndarray, "1 draws"]) -> dict[str, Any]:
     return judges.words(p < ALPHA, f"exact binomial: {k} of {n} held-out draws above {PROBED}", p=p, n=n)
 
 
+def drives_and_commits(spawn: Result, mouths: Sequence[Result]) -> float:
+    """How well a navigator drives either corridor and yet holds on to one: what a curriculum is chosen by.
+
+    The success from in front of the worse mouth, that corridor free, times the least share of one corridor from the
+    spawn; it never looks at coverage.
+    """
+    return min(mouth["success"].mean() for mouth in mouths) * commitment(spawn)[1]
+
+
 # --- coverage
-class Row(NamedTuple):
-    """Counts over the episodes of one row of the sweep."""
-
-    n: int
-    covered: int  # entered the alternative corridor
-    succeeded: int
-    through: int  # succeeded without ever entering the alternative corridor
-
-    @property
-    def shares(self) -> tuple[float, float]:
-        """Coverage and success."""
-        return self.covered / self.n, self.succeeded / self.n
-
-    @property
-    def competence(self) -> float:
-        """Success among the episodes that did not enter the alternative corridor; NaN if all entered it."""
-        return self.through / (self.n - self.covered) if self.covered < self.n else float("nan")
-
-
-def count_rows(swept: Result, alternative: int) -> list[Row]:
-    """The counts for each row of a sweep; `alternative` is the corridor (0 left, 1 right) whose entry is coverage."""
-    covered, success = swept["entered"][..., alternative], swept["success"]  # (rows, episodes) each
-    return [Row(len(c), int(c.sum()), int(s.sum()), int((s & ~c).sum())) for c, s in zip(covered, success, strict=True)]
-
-
 def sweep_row(
-    covered: Bool[np.ndarray, "1 episodes"],
-    succeeded: Bool[np.ndarray, "1 episodes"],
+    covered: Bool[np.ndarray, "seeds episodes"],
+    succeeded: Bool[np.ndarray, "seeds episodes"],
     *,
     side: str,
     coverage: float,
@@ -153,33 +138,40 @@ def sweep_row(
     side, coverage  whether coverage must be 'above' or 'below' this share
     competent       whether success must be above COMPETENT, or below; None if the paper prints one half
     """
-    n, k, s = covered.size, int(covered.sum()), int(succeeded.sum())
-    sides = {"above": stats.above, "below": stats.below}
-    tests = {f"coverage {side} {coverage}": sides[side](k, n, coverage)}
+    sides = {"above": stats.mean_above, "below": stats.mean_below}
+    tests = {f"coverage {side} {coverage}": sides[side](covered, coverage)}
     if competent is not None:
         where = "above" if competent else "below"
-        tests[f"success {where} {COMPETENT}"] = sides[where](s, n, COMPETENT)
-    low, high = zip(stats.wilson(k, n), stats.wilson(s, n), strict=True)
+        tests[f"success {where} {COMPETENT}"] = sides[where](succeeded, COMPETENT)
+    low, high = zip(stats.interval(covered), stats.interval(succeeded), strict=True)
     p = max(tests.values())
     return {
-        "value": (k / n, s / n),
+        "value": (covered.mean(), succeeded.mean()),
         "low": low,
         "high": high,
-        "n": n,
-        "test": f"exact binomial: {' and '.join(tests)}; the larger p",
+        "n": len(covered),
+        "test": f"mean over seeds: {' and '.join(tests)}; the larger p",
         "p": p,
         "holds": p < ALPHA,
     }
 
 
-def opposed(covered: Bool[np.ndarray, "rows episodes"], succeeded: Bool[np.ndarray, "rows episodes"]) -> dict[str, Any]:
-    """Whether coverage and success move in opposite directions over the rows.
+def off_alternative(covered: Bool[np.ndarray, "..."], succeeded: Bool[np.ndarray, "..."]) -> float:
+    """Success among the episodes that did not enter the alternative corridor; NaN if all entered it."""
+    return float(succeeded[~covered].mean()) if not covered.all() else float("nan")
+
+
+def opposed(*rows: Bool[np.ndarray, "seeds episodes"]) -> dict[str, Any]:
+    """Whether coverage and success, both means over seeds, move in opposite directions over the rows of the sweep.
 
     Behind a solid slab an entry costs a success by construction, so the test takes success among the episodes that did
     not enter the alternative corridor.
+
+    rows  the coverage of every row, then the success of every row
     """
-    coverage, success = covered.mean(axis=1), succeeded.mean(axis=1)
-    through = (succeeded & ~covered).sum(axis=1) / np.maximum(1, (~covered).sum(axis=1))
+    covered, succeeded = _halves(rows)
+    coverage, success = (np.array([row.mean() for row in side]) for side in (covered, succeeded))
+    through = np.nan_to_num([off_alternative(*pair) for pair in zip(covered, succeeded, strict=True)])
     rho, p = opposition(coverage, through)
     whole = opposition(coverage, success)[0]
     return {
@@ -193,36 +185,38 @@ def opposed(covered: Bool[np.ndarray, "rows episodes"], succeeded: Bool[np.ndarr
     }
 
 
-def only_where_collapsed(
-    covered: Bool[np.ndarray, "rows episodes"], succeeded: Bool[np.ndarray, "rows episodes"]
-) -> dict[str, Any]:
+def only_where_collapsed(*rows: Bool[np.ndarray, "seeds episodes"]) -> dict[str, Any]:
     """Whether coverage becomes nonzero only at noise at which success has collapsed.
 
-    It holds if some row is covered, and if in every row with an entry success is below COMPETENT (the largest p).
+    It holds if some row is covered, and if in every row whose coverage prints as nonzero (0.005 or more) success is
+    below COMPETENT (the largest p).
+
+    rows  the coverage of every row, then the success of every row
     """
-    nonzero = covered.any(axis=1)
-    p = max((stats.below(int(s.sum()), len(s), COMPETENT) for s in succeeded[nonzero]), default=1.0)
-    most = succeeded[nonzero].mean(axis=1).max(initial=0.0)
-    test = f"exact binomial of every row with an entry: success below {COMPETENT}; the largest is {most:.2f}"
-    return judges.words(bool(nonzero.any()) and p < ALPHA, test, p=p, n=len(covered))
+    reached = [succeeded for covered, succeeded in zip(*_halves(rows), strict=True) if covered.mean() >= PRINTED]
+    p = max((stats.mean_below(row, COMPETENT) for row in reached), default=1.0)
+    most = max((row.mean() for row in reached), default=0.0)
+    test = f"in every row with coverage, success below {COMPETENT}; the largest is {most:.2f}"
+    return judges.words(bool(reached) and p < ALPHA, test, p=p, n=len(rows[0]))
 
 
-def noise_reaches(covered: Bool[np.ndarray, "1 episodes"]) -> dict[str, Any]:
+def _halves(rows: Sequence[Outcomes]) -> tuple[Sequence[Outcomes], Sequence[Outcomes]]:
+    return rows[: len(rows) // 2], rows[len(rows) // 2 :]
+
+
+def noise_reaches(covered: Bool[np.ndarray, "seeds episodes"]) -> dict[str, Any]:
     """Whether correlated noise in the window reaches the decision: coverage above RARE."""
-    k, n = int(covered.sum()), covered.size
-    p = stats.above(k, n, RARE)
-    return judges.words(p < ALPHA, f"exact binomial: coverage {k} of {n} above {RARE}", p=p, n=n)
+    p = stats.mean_above(covered, RARE)
+    return judges.words(p < ALPHA, f"coverage {covered.mean():.3f}, above {RARE} in the mean", p=p, n=len(covered))
 
 
 def competence_destroyed(
-    quiet: Bool[np.ndarray, "1 episodes"], noisy: Bool[np.ndarray, "1 episodes"]
+    quiet: Bool[np.ndarray, "seeds episodes"], noisy: Bool[np.ndarray, "seeds episodes"]
 ) -> dict[str, Any]:
     """Whether noise over the whole episode destroys competence: success below COMPETENT, and below the quiet row's."""
-    (k, n), (q, m) = ((int(row.sum()), row.size) for row in (noisy, quiet))
-    p = max(stats.below(k, n, COMPETENT), stats.fewer((k, n), (q, m)))
-    return judges.words(
-        p < ALPHA, f"success {k} of {n}: below {COMPETENT} and below {q} of {m}; the larger p", p=p, n=n
-    )
+    p = max(stats.mean_below(noisy, COMPETENT), stats.mean_less(noisy, quiet))
+    test = f"success {noisy.mean():.2f}: below {COMPETENT} and below {quiet.mean():.2f}; the larger p"
+    return judges.words(p < ALPHA, test, p=p, n=len(noisy))
 
 
 def opposition(coverage: Float[np.ndarray, " n"], success: Float[np.ndarray, " n"]) -> tuple[float, float]:
@@ -273,14 +267,12 @@ def flip_costs(true: Bool[np.ndarray, "seeds episodes"], flipped: Bool[np.ndarra
     }
 
 
-def bit_diagnosis(flips: Mapping[tuple[str, bool], Sequence[Result]], incumbents: Sequence[int]) -> Diagnosis:
-    """Diagnoses the bit from `transfer.Examined.flips` and the incumbent corridor of each seed."""
-    shift = [np.concatenate([r[i]["shift"][0] for r in flips.values()]).mean(0) for i in range(len(incumbents))]
-    first = [np.concatenate([r[i]["first"][0] for r in flips.values()]) == side for i, side in enumerate(incumbents)]
-    success = (
-        np.stack([flips[SIDES[1 - side], truthful][i]["success"][0] for i, side in enumerate(incumbents)])
-        for truthful in (True, False)
-    )
+def bit_diagnosis(flips: Sequence[Mapping[tuple[str, bool], Result]], incumbents: Sequence[int]) -> Diagnosis:
+    """Diagnoses the bit from what `transfer.Bit` holds of every seed."""
+    shift = [np.concatenate([r["shift"][0] for r in own.values()]).mean(0) for own in flips]
+    pairs = list(zip(flips, incumbents, strict=True))
+    first = [np.concatenate([r["first"][0] for r in own.values()]) == side for own, side in pairs]
+    success = (np.stack([own[SIDES[1 - side], true]["success"][0] for own, side in pairs]) for true in (True, False))
     return Diagnosis(np.array(shift), np.array(first), tuple(success))
 
 
@@ -301,49 +293,51 @@ def window_ratio(rollout: RolloutConfig, boost: Boost, factor: float = 1.0) -> f
     return (rollout.horizon - inside) / inside * factor
 
 
-def boost_opens(*blocks: Bool[np.ndarray, "1 episodes"]) -> dict[str, Any]:
+def boost_opens(*blocks: Bool[np.ndarray, "seeds episodes"]) -> dict[str, Any]:
     """Alternative-corridor success with the boost, smallest and largest block; holds if all together exceed RARE."""
-    k, n = sum(int(block.sum()) for block in blocks), sum(block.size for block in blocks)
-    p = stats.above(k, n, RARE)
-    return _range(blocks) | {"n": n, "test": f"exact binomial: {k} of {n} above {RARE}", "p": p, "holds": p < ALPHA}
+    p = stats.mean_above(np.concatenate(blocks, axis=1), RARE)
+    return _range(blocks) | {"n": len(blocks[0]), "test": f"mean over seeds above {RARE}", "p": p, "holds": p < ALPHA}
 
 
-def boost_fades(*blocks: Bool[np.ndarray, "1 episodes"], early: int) -> dict[str, Any]:
+def boost_fades(*blocks: Bool[np.ndarray, "seeds episodes"], early: int) -> dict[str, Any]:
     """The same of the late blocks, after so many early ones; holds if success is below the early blocks'."""
-    first, last = (
-        (sum(int(block.sum()) for block in part), sum(block.size for block in part))
-        for part in (blocks[:early], blocks[early:])
-    )
-    p = stats.fewer(last, first)
+    first, last = (np.concatenate(part, axis=1) for part in (blocks[:early], blocks[early:]))
+    p = stats.mean_less(last, first)
     return _range(blocks[early:]) | {
-        "n": last[1],
-        "test": "Fisher's exact test, below early",
+        "n": len(blocks[0]),
+        "test": "mean over seeds, below early",
         "p": p,
         "holds": p < ALPHA,
     }
 
 
 def _range(blocks: Sequence[Outcomes]) -> dict[str, Any]:
-    """The smallest and the largest share of some blocks, with their Wilson intervals."""
+    """The smallest and the largest share of some blocks, with their intervals."""
     shares = [block.mean() for block in blocks]
     ends = [blocks[int(place)] for place in (np.argmin(shares), np.argmax(shares))]
-    intervals = [stats.wilson(int(block.sum()), block.size) for block in ends]
-    low, high = zip(*intervals, strict=True)
+    low, high = zip(*map(stats.interval, ends), strict=True)
     return {"value": (min(shares), max(shares)), "low": low, "high": high}
 
 
 def alternative_outcomes(
-    trained: Result, incumbent: int, edges: Sequence[int] | np.ndarray
-) -> list[Bool[np.ndarray, "1 episodes"]]:
-    """Whether each episode of the intervals between iteration edges arrived; an interval without episodes is left out.
+    trained: Sequence[Result], incumbents: Sequence[int], edges: Sequence[int] | np.ndarray
+) -> list[Bool[np.ndarray, "seeds episodes"]]:
+    """Whether each episode between iteration edges arrived, one array per interval; an empty interval is left out.
 
-    Takes the training episodes from the spawn in which the slab blocks the incumbent corridor; `trained` is a result of
-    `train_navigator`.
+    Takes the training episodes from the spawn in which the slab blocks the incumbent corridor; of seeds with more
+    episodes than another, the last ones are dropped. `trained` are results of `train_navigator`.
     """
-    update, slab, _, arrived = trained["episodes"].T  # (episodes,) each
-    interval = np.digitize(update + 0.5, edges)
-    parts = [arrived[(slab == incumbent) & (interval == k)] == 1 for k in range(1, len(edges))]
-    return [part[None] for part in parts if len(part)] or [np.zeros((1, 1), bool)]
+    by_seed = []
+    for result, incumbent in zip(trained, incumbents, strict=True):
+        update, slab, _, arrived = result["episodes"].T  # (episodes,) each
+        interval = np.digitize(update + 0.5, edges)
+        by_seed.append([arrived[(slab == incumbent) & (interval == k)] == 1 for k in range(1, len(edges))])
+    blocks = []
+    for parts in zip(*by_seed, strict=True):
+        shortest = min(map(len, parts))
+        if shortest:
+            blocks.append(np.stack([part[:shortest] for part in parts]))
+    return blocks or [np.zeros((len(trained), 1), bool)]
 
 
 def alternative_success(trained: Result, incumbent: int, edges: Sequence[int] | np.ndarray) -> Int[np.ndarray, "k 2"]:

@@ -208,11 +208,15 @@ def train_navigator(
         if taken in config.looks:
             kept |= state_of(navigator, f"{taken}.navigator")
         report((i + 1) / updates)
-    return state_of(navigator, "navigator") | kept | {
-        "episodes": np.concatenate(episodes).astype(np.int64),
-        "sigma": np.array(sigmas),
-        "boost": np.array(boosts),
-    }
+    return (
+        state_of(navigator, "navigator")
+        | kept
+        | {
+            "episodes": np.concatenate(episodes).astype(np.int64),
+            "sigma": np.array(sigmas),
+            "boost": np.array(boosts),
+        }
+    )
 
 
 def stopped(trained: Mapping[str, np.ndarray], look: int, updates: int) -> dict[str, np.ndarray]:

@@ -32,8 +32,8 @@ DIRECT: Mapping[str, dict[str, Any]] = MappingProxyType(
         "wide layout": {"layout": "wide"},
     }
 )
-# Navigators that nobody tells anything, by where they learn to drive: whether the slab leaves them a choice of corridor,
-# and whether they also start in front of the mouths. The swept navigator of Table II is one of them
+# Navigators that nobody tells anything, by where they learn to drive: whether the slab leaves them a choice, and
+# whether they also start in front of the mouths. The navigators of Table II have one of these curricula
 CURRICULA: Mapping[str, dict[str, Any]] = MappingProxyType(
     {
         "one corridor, past the mouths": {"content": "floor", "blocked": "right"},
@@ -42,7 +42,7 @@ CURRICULA: Mapping[str, dict[str, Any]] = MappingProxyType(
     }
 )
 # The controls: the bit itself, the missing coverage supplied by hand, no message, and no choice of corridor
-ORACLE, BOTH_MOUTHS = "oracle", "shown both mouths"
+ORACLE, BOTH_MOUTHS, PRETRAINED = "oracle", "shown both mouths", "pretrained"
 SILENT = {"silent": "either corridor, past the mouths", "no choice": "one corridor, past the mouths"}
 # What might give the bit a use inside the corridor: contact that costs time instead of the episode, time that costs
 BITS: Mapping[str, dict[str, Any]] = MappingProxyType(
@@ -134,7 +134,8 @@ class DirectTransfer:
     ) -> dict[str, list[Result]]:
         """Every navigator of the null result after `navigator.steps` control steps, by name.
 
-        pretrained  of `pretrained`: the first seeds of two curricula are the controls SILENT
+        pretrained  of `pretrained`: the first seeds of two curricula are the controls SILENT, and all seeds of the
+                    chosen one are PRETRAINED, the navigators of Table II
         oracle      the oracle's trainings of `told`
         """
         changes = {name: {"content": "latent"} | DIRECT[name] for name in configurations}
@@ -146,6 +147,7 @@ class DirectTransfer:
             ORACLE: [self._stopped(each) for each in oracle],
             **silent,
             BOTH_MOUTHS: trained[BOTH_MOUTHS],
+            PRETRAINED: [self._stopped(each) for each in pretrained[self.pretraining.curriculum]],
         }
 
     def told(self, seeds: int) -> dict[str, list[Result]]:
@@ -158,6 +160,11 @@ class DirectTransfer:
     def bit_looks(self) -> tuple[int, ...]:
         """Control steps after which the use of the bit is measured; `navigator.steps` is one of them."""
         return tuple(sorted({*self.pretraining.bit_looks, self.navigator.steps}))
+
+    def grown(self, pretrained: Mapping[str, list[Result]]) -> Examined:
+        """Plays the navigators of every curriculum after the last look, as `examined` does."""
+        last = self.pretraining.looks[-1]
+        return self.examined({name: [after(each, last) for each in trained] for name, trained in pretrained.items()})
 
     def examined(self, navigators: Mapping[str, list[Result]]) -> Examined:
         """Plays the frozen navigators from the spawn, and from in front of either mouth.
@@ -270,8 +277,8 @@ class DirectTransfer:
         return NavigatorConfig(**(self.navigator.model_dump(exclude_computed_fields=True) | dict(change)))
 
     def _rollout(self, name: str, **changes: Any) -> RolloutConfig:
-        """Episodes of a navigator of the null result, in the scene and with the content that it was trained with."""
-        content = {ORACLE: "oracle", BOTH_MOUTHS: "oracle"} | dict.fromkeys(SILENT, "floor")
+        """Episodes of a navigator, by its name, in the scene and with the content that it was trained with."""
+        content = {ORACLE: "oracle", BOTH_MOUTHS: "oracle"} | dict.fromkeys((*SILENT, *CURRICULA, PRETRAINED), "floor")
         layout = {"layout": DIRECT[name]["layout"]} if "layout" in DIRECT.get(name, {}) else {}
         return self._configured(content=content.get(name, "latent"), **layout, **changes)
 
