@@ -16,8 +16,9 @@ from lt_lib.hardware.sessions import Session, film_session, film_sweep, session_
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.gates import encode
+from lt_lib.pixels.episodes import obedience, roll_bank
 from lt_lib.pixels.executor import ROUTES, FrozenExecutor, train_executor
-from lt_lib.settings.base import ROOT, everywhere
+from lt_lib.settings.base import ROOT, UserError, everywhere
 from lt_lib.settings.devices import computing_device
 from lt_lib.settings.hardware import (
     HardwareGates,
@@ -27,7 +28,7 @@ from lt_lib.settings.hardware import (
     SessionsConfig,
     SweepConfig,
 )
-from lt_lib.settings.pixels import ExecutorConfig
+from lt_lib.settings.pixels import BankConfig, ExecutorConfig
 from lt_lib.settings.profiles import validated
 from lt_lib.settings.streams import Stream
 from lt_lib.store.files import runs_folder
@@ -137,16 +138,35 @@ class HardwareProtocol:
         strengths = self.sessions.live.optics.model_dump() | self.sessions.live.bench.model_dump()
         return {effect: float(strengths[effect]) for effect in effects}
 
-    def after_selection(self, candidate: str, encoder: Result, seeds: int) -> tuple[Result, list[Result]]:
+    def after_selection(
+        self, candidate: str, encoder: Result, seeds: int, lengths: Sequence[int]
+    ) -> tuple[Result, list[Result]]:
         """The executor behind the selected encoder, and encoders of the cheaper size in its appearances, one per seed.
 
         They are computed side by side, since neither waits for the other.
+
+        lengths  control steps, increasing, after which the executor's weights are kept; `executor.steps` is one of them
+
+        Raises UserError for other lengths.
         """
+        update = self.executor.envs * self.executor.rollout
+        if self.executor.steps not in lengths or any(length % update for length in lengths):
+            raise UserError(
+                f"lengths: expected multiples of {update} control steps, executor.steps {self.executor.steps} among "
+                f"them, got {list(lengths)}"
+            )
         config = self.cheap.model_copy(update=self.gates.candidates[candidate])
-        runs = [Run(train_executor, self.executor, SEED, {"encoder": encoder})]
+        driving = self.executor.model_copy(update={"steps": max(lengths), "looks": tuple(lengths)})
+        runs = [Run(train_executor, driving, SEED, {"encoder": encoder})]
         runs += [Run(train_matched_encoder, config, seed) for seed in range(seeds)]
         driver, *cheap = self.store.fetch(runs, "executor and encoder seeds")
         return driver, cheap
+
+    def obedience(self, encoder: Result, drivers: Mapping[int, Result]) -> dict[int, float]:
+        """Share of episodes from the spawn, under either placement and route, that enter that corridor, by length."""
+        config = BankConfig(layout=self.executor.layout, device=self.executor.device, entries=self.rails.draws)
+        runs = [Run(roll_bank, config, SEED, {"encoder": encoder, "executor": driver}) for driver in drivers.values()]
+        return dict(zip(drivers, map(obedience, self.store.fetch(runs, "obedience")), strict=True))
 
 
 def past_the_rails(config: RailsConfig, encoder: Result, executor: Result) -> Float[np.ndarray, "routes axes"]:

@@ -190,6 +190,12 @@ def edges(slow: Success, fast: Success, *, z: Z) -> dict[str, Any]:
     return found | {"test": f"Fisher's exact test, fewer runs solved at the smaller rate: {words}", "holds": p < ALPHA}
 
 
+def fast_edge(slow: Success, fast: Success, *, z: Z) -> dict[str, Any]:
+    """As `edges`, for the edge of the largest rate alone."""
+    found = edges(slow, fast, z=z)
+    return found | {"value": found["value"][1]}
+
+
 def falls_to_zero(success: Success, *, z: Z) -> dict[str, Any]:
     """Whether the solved share falls from 1 to 0: all runs of the settings of smallest z, none of largest."""
     solved, order = success >= CEILING, np.argsort(z)

@@ -61,6 +61,14 @@ class Runs(NamedTuple):
         return values[:: self.seeds]
 
 
+class Tried(NamedTuple):
+    """The Gaussian arm for one choice of what the paper does not print, under Adam and under plain gradient ascent."""
+
+    adam: Runs
+    slow: Runs  # at the smallest rate
+    fast: Runs  # at the largest
+
+
 @dataclass(frozen=True)
 class ZStudy:
     """The study at one size.
@@ -110,6 +118,24 @@ class ZStudy:
         results = self.store.fetch([Run(train_point_mass, s, SEED) for s in self._stacks(parts)], "point-mass runs")
         each = _batched(results, len(self.windows))
         return {name: self._joined(part, own) for (name, part), own in zip(parts.items(), each, strict=True)}
+
+    def tried(
+        self, grids: Sequence[tuple[float, ...]], scores: Sequence[str], rates: Sequence[float]
+    ) -> dict[tuple[int, str], Tried]:
+        """Gaussian runs at every look, by the number of a grid of d and by how a window's score is taken."""
+        arms = {"adam": {}} | {rate: {"optimiser": "sgd", "lr": rate} for rate in (min(rates), max(rates))}
+        parts = {
+            (i, score, arm): self.config.model_copy(
+                update={"distances": tuple(grid), "score": score, "budgets": tuple(self.looks)} | change
+            )
+            for i, grid in enumerate(grids)
+            for score in scores
+            for arm, change in arms.items()
+        }
+        results = self.store.fetch([Run(train_point_mass, s, SEED) for s in self._stacks(parts)], "what is not printed")
+        each = _batched(results, len(self.windows))
+        runs = {name: self._joined(part, own) for (name, part), own in zip(parts.items(), each, strict=True)}
+        return {(i, score): Tried(*(runs[i, score, arm] for arm in arms)) for i, score, _ in runs}
 
     def stacking_gain(self, rates: Sequence[float], singles: int, updates: int) -> tuple[float, float]:
         """CPU seconds of the whole study, stacked and one run after another.

@@ -154,3 +154,8 @@ def roll_bank(
     )
     shaped = {name: values.reshape(shape) for name, values in outcome._asdict().items()}
     return draws._asdict() | shaped | {"commit_step": config.commit_step, "held_out": config.held_out}
+
+
+def obedience(bank: Mapping[str, Any]) -> float:
+    """Share of a bank's episodes in which the executor entered the commanded corridor."""
+    return float((bank["entered"] == np.arange(ROUTES)).mean())

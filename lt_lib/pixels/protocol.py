@@ -16,7 +16,7 @@ from lt_lib.envs.layout import load_layout
 from lt_lib.perception.gates import Measured, measure_gates, require_gates
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import facts_of, load_frozen, save_frozen
-from lt_lib.pixels.episodes import ROUTES, roll_bank
+from lt_lib.pixels.episodes import roll_bank
 from lt_lib.pixels.executor import train_executor
 from lt_lib.pixels.redraw import REDRAWS, SCENES, train_redrawn_head
 from lt_lib.pixels.route import evaluate_head, train_head
@@ -185,8 +185,3 @@ class PixelProtocol:
         same = {key: getattr(self.sizes.head, key) for key in ("minibatch", "lr")}
         varied = {"content": row.content, "every": row.every, "credit": row.credit}
         return self.sizes.redraw.model_copy(update=same | varied)
-
-
-def obedience(bank: Result) -> float:
-    """Share of the bank's episodes in which the executor entered the commanded corridor."""
-    return float((bank["entered"] == np.arange(ROUTES)).mean())

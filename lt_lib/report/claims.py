@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from lt_lib.report.firmness import firmness
+from lt_lib.report.inferred import calibrating_rows
 from lt_lib.settings.base import ROOT, Settings, UserError, read_yaml, require_known
 from lt_lib.settings.profiles import explain
 from lt_lib.store.files import content_digest, writable_folder, write_atomically
@@ -66,6 +67,7 @@ class Claim(Settings):
     refuted: str = ""
     follows: str = ""
     gate: bool = False
+    calibrates: str = ""  # the setting that was inferred from this row; stands in inferred.yaml, not here
     digits: int | None = None
     margin: Numbers | None = None
     at_least: Number | None = None
@@ -133,7 +135,7 @@ def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
     Raises a one-line UserError with the id for an unreadable file, an unknown key or notebook, a missing or malformed
     value, a duplicate id, and a criterion that does not suit the kind.
     """
-    entries = read_yaml(path)
+    entries, rows = read_yaml(path), calibrating_rows()
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise UserError(f"{path.name}: expected a list of entries '- {{id: ..., nb: ..., ...}}'")
     claims: dict[str, Claim] = {}
@@ -142,7 +144,7 @@ def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
         if claim.id in claims:
             raise UserError(f"{path.name}: {claim.id} appears twice")
         claims[claim.id] = claim
-    return claims
+    return {name: claim.model_copy(update={"calibrates": rows.get(name, "")}) for name, claim in claims.items()}
 
 
 def _parse(model: type[Settings], entry: Mapping[str, Any], where: str) -> Any:
@@ -167,6 +169,7 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
     not run         there is no finding
     '' (none)       the profile is not the full one, so the run is too small to tell
     needs a robot   a hardware claim without real frames; with real frames it counts as measured
+    calibrated      a setting that the paper does not print was inferred from this row, so it counts for nothing
     gate            a threshold that stops the run where it is missed, so the row cannot fail
     context         geometry or settings that the paper does not print, or a finding that it does not have
     reproduced      the claim's criterion (below) is met, and its own test, which could have failed, holds
@@ -183,6 +186,8 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
         return NOT_RUN
     if profile != JUDGED:
         return NO_VERDICT
+    if claim.calibrates:
+        return CALIBRATED
     if claim.kind == "hardware" and not finding.real_frames:
         return NEEDS_A_ROBOT
     met = _criterion_met(claim, finding)

@@ -171,9 +171,9 @@ def deviations(board: pd.DataFrame) -> pd.DataFrame:
 
 
 def independent(board: pd.DataFrame) -> pd.DataFrame:
-    """The measured facts, each once: no settings, no context, no gates, and no row that follows from another."""
-    apart = (*SETTINGS, "scene", "ours")
-    return board[~board.kind.isin(apart) & (board.follows == "") & ~board.verdict.isin((GATE, NEEDS_A_ROBOT))]
+    """The measured facts, each once: no settings, no context, no gates, no calibrating row, and none that follows."""
+    apart, uncounted = (*SETTINGS, "scene", "ours"), (GATE, NEEDS_A_ROBOT, CALIBRATED)
+    return board[~board.kind.isin(apart) & (board.follows == "") & ~board.verdict.isin(uncounted)]
 
 
 def summary(board: pd.DataFrame) -> str:
@@ -187,6 +187,7 @@ def summary(board: pd.DataFrame) -> str:
     apart = {
         "settings and exact numbers": f"{agree} of {len(settings)}",
         "rows that follow from another": (board.follows != "").sum(),
+        "calibrated": (board.verdict == CALIBRATED).sum(),
         "gates": (board.verdict == GATE).sum(),
         "context": board.kind.isin(("scene", "ours")).sum(),
         "needs a robot": (board.verdict == NEEDS_A_ROBOT).sum(),

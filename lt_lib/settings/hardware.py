@@ -97,6 +97,7 @@ class RailsConfig(Training):
     layout: str = "matched"
     rollouts: PositiveInt = 64
     length: PositiveInt = 32
+    draws: PositiveInt = 32  # of the scene, each under both placements and both routes, for its obedience
 
 
 class HardwareGates(Settings):

@@ -11,7 +11,7 @@ import yaml
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
 from lt_lib.settings.base import ROOT, UserError, refuse_decided, require_known
-from lt_lib.settings.gridworld import GridworldConfig
+from lt_lib.settings.gridworld import GridworldConfig, Scaled
 from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, RailsConfig, SessionsConfig
 from lt_lib.settings.learnability import Budget, PointMassConfig
 from lt_lib.settings.pixels import ExecutorConfig, PixelsConfig
@@ -158,10 +158,15 @@ SECTIONS: dict[str, Any] = {
     "gridworld": GridworldConfig,
     "peek_seeds": dict[str, PositiveInt],
     "ablation_seeds": PositiveInt,
+    "forms": Annotated[list[Scaled], Field(min_length=2)],
+    "form_seeds": PositiveInt,
     "point_mass": PointMassConfig,
     "windows": Annotated[list[PositiveInt], Field(min_length=2)],
     "looks": Annotated[list[Budget], Field(min_length=1)],
     "sgd_rates": Annotated[list[PositiveFloat], Field(min_length=2)],
+    "grids": Annotated[list[Annotated[list[PositiveFloat], Field(min_length=2)]], Field(min_length=1)],
+    "scores": Annotated[list[Literal["sum", "mean"]], Field(min_length=1)],
+    "budgets": Annotated[list[Budget], Field(min_length=1)],
     "resamples": Annotated[int, Field(ge=2)],
     "singles": PositiveInt,
     "timed_updates": Budget,
@@ -186,6 +191,7 @@ SECTIONS: dict[str, Any] = {
     "sessions": SessionsConfig,
     "sweep": dict[Literal["hazard", "clear", "shots"], PositiveInt],
     "rails": RailsConfig,
+    "lengths": Annotated[list[PositiveInt], Field(min_length=1)],
     "encoder_seeds": Annotated[int, Field(ge=2)],
     "simulated": Annotated[int, Field(ge=2)],
     "effects": Annotated[list[str], Field(min_length=1)],
