@@ -17,7 +17,8 @@ from lt_lib.settings.base import ROOT
 from lt_lib.velocity import judgements as velocity
 from lt_lib.velocity.coverage import STATED
 
-CLAIMS = load_claims()
+# as if no row had been set aside: a calibrating row has a judge like any other
+CLAIMS = {name: claim.model_copy(update={"calibrates": ""}) for name, claim in load_claims().items()}
 
 
 def seeds(*shares: float, n: int = 500) -> np.ndarray:
@@ -32,6 +33,11 @@ def real(*shares: float, n: int = 256) -> np.ndarray:
 
 def one(share: float, n: int = 128) -> np.ndarray:
     return seeds(share, n=n)
+
+
+def three(share: float, n: int = 128) -> np.ndarray:
+    """Three navigators alike."""
+    return seeds(share, share, share, n=n)
 
 
 ONES, HALF = seeds(1, 1, 0.99, 1, 1), seeds(0.49, 0.5, 0.52, 0.47, 0.5)
@@ -92,8 +98,9 @@ ORACLE = ((seeds(1, n=256), seeds(0.9, n=256)), (seeds(1, n=256), seeds(0.53, n=
 LOST = [real(1, 1, 1), *[real(0.5, 0.45, 0.1)] * 4]
 KEPT = [real(1, 1, 1), *[real(0.95, 0.96, 0.97)] * 4]
 SAME, CHANGED = np.zeros((5, 256)), np.tile([1.0, 0.0, 0.0, 0.0], (5, 64))
-SWEEP_UP, SWEEP_FLAT = seeds(0, 0, 0.02, 0.05, 0.1, 0.2, 0.3, n=128), seeds(*[0.9] * 7, n=128)
-SWEEP_DOWN = seeds(0.9, 0.85, 0.4, 0.3, 0.2, 0.1, 0.05, n=128)
+SWEEP_UP = [three(share) for share in (0, 0, 0.02, 0.05, 0.1, 0.2, 0.3)]
+SWEEP_DOWN = [three(share) for share in (0.9, 0.85, 0.4, 0.3, 0.2, 0.1, 0.05)]
+SWEEP_FLAT = [three(0.9)] * 7
 
 # id: the judge of its row, samples that refute the claim, samples that support it
 CASES = {
@@ -164,29 +171,33 @@ CASES = {
     "port.null_oracle": (velocity.range_committed, first_of(True), first_of(False)),
     "port.null_silent": (velocity.one_committed, one_of(True), one_of(False)),
     "port.probe": (velocity.probe_recovers, (one(0.9),), (one(1.0),)),
-    "port.held": (partial(velocity.held_near, d=0.83), (np.full(24, 0.2),), (np.linspace(0.8, 0.9, 24),)),
+    "port.held": (
+        partial(velocity.held_near, d=0.83),
+        (np.full((3, 64), 0.2),),
+        (np.linspace(0.75, 0.9, 3 * 64).reshape(64, 3).T,),
+    ),
     "port.remedy": (words_above, (HALF, HALF), (ONES, HALF)),
     **{
         name: (
             partial(velocity.sweep_row, side=side, coverage=coverage, competent=competent),
             # the paper's opposite: no coverage where it reaches, success where it collapses
-            (one(0.0 if side == "above" else 0.4), one(0.0 if competent else 1.0)),
-            (one(CLAIMS[name].paper[0]), one(CLAIMS[name].paper[1])),
+            (three(0.0 if side == "above" else 0.4), three(0.0 if competent else 1.0)),
+            (three(CLAIMS[name].paper[0]), three(CLAIMS[name].paper[1])),
         )
         for name, (side, coverage, competent) in STATED.items()
     },
-    "cov.opposition": (velocity.opposed, (SWEEP_UP, np.ones_like(SWEEP_UP)), (SWEEP_UP, SWEEP_DOWN)),
-    "cov.collapse_first": (velocity.only_where_collapsed, (SWEEP_UP, SWEEP_FLAT), (SWEEP_UP, SWEEP_DOWN)),
-    "cov.reaches": (velocity.noise_reaches, (one(0.03),), (one(0.22),)),
-    "cov.destroys": (velocity.competence_destroyed, (one(0.95), one(0.91)), (one(0.68), one(0.1))),
+    "cov.opposition": (velocity.opposed, (*SWEEP_UP, *[three(1.0)] * 7), (*SWEEP_UP, *SWEEP_DOWN)),
+    "cov.collapse_first": (velocity.only_where_collapsed, (*SWEEP_UP, *SWEEP_FLAT), (*SWEEP_UP, *SWEEP_DOWN)),
+    "cov.reaches": (velocity.noise_reaches, (three(0.03),), (three(0.22),)),
+    "cov.destroys": (velocity.competence_destroyed, (three(0.95), three(0.91)), (three(0.68), three(0.1))),
     "cov.bit_shift": (velocity.shifted, (np.array([2.0, 0.2]),), (np.array([2.6, 2.8]),)),
     "cov.bit_route": (greedy, (seeds(1, 0.9),), (seeds(1, 1),)),
     "cov.bit_success": (velocity.flip_costs, (one(0.8), one(0.8)), (one(1.0), one(0.41))),
-    "cov.boost_early": (velocity.boost_opens, (one(0.0), one(0.01)), (one(0.19), one(0.26))),
+    "cov.boost_early": (velocity.boost_opens, (three(0.0), three(0.01)), (three(0.19), three(0.26))),
     "cov.boost_late": (
         partial(velocity.boost_fades, early=1),
-        (one(0.2), one(0.2)),
-        (one(0.2), one(0.0), one(0.05)),
+        (three(0.2), three(0.2)),
+        (three(0.2), three(0.0), three(0.05)),
     ),
     "z.center": (partial(learnability.centre, z=Z, paper=4.2), (learned(9.0),), (learned(4.2),)),
     "z.collapse": (
@@ -214,6 +225,11 @@ CASES = {
     "z.sgd_edge": (
         partial(learnability.edges, z=Z),
         (learned(4.0), learned(4.0)),
+        (learned(3.1, 0.01), learned(5.8, 0.01)),
+    ),
+    "z.sgd_fast": (
+        partial(learnability.fast_edge, z=Z),
+        (learned(5.8, 0.01), learned(5.8, 0.01)),
         (learned(3.1, 0.01), learned(5.8, 0.01)),
     ),
     "z.falls": (partial(learnability.falls_to_zero, z=Z), (learned(30.0),), (learned(5.0),)),

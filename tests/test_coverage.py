@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from scipy.stats import spearmanr
 
 from lt_lib.comm.channel import ANCHOR
@@ -11,13 +12,14 @@ from lt_lib.envs.layout import load_layout
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.pixels.episodes import draw_scenes
 from lt_lib.report.claims import load_claims
-from lt_lib.settings.velocity import Boost, Configuration, NavigatorConfig, RolloutConfig
+from lt_lib.settings.base import UserError
+from lt_lib.settings.velocity import Boost, Configuration, NavigatorConfig, PretrainingConfig, RolloutConfig
 from lt_lib.velocity import judgements
 from lt_lib.velocity.coverage import TABLE_2, WINDOWED, Imposed, explore, play, started
 from lt_lib.velocity.diagnostics import command_error, message_error
-from lt_lib.velocity.navigator import LATERAL, Errand, Navigator, Scouts, annealed, train_navigator
+from lt_lib.velocity.navigator import LATERAL, Errand, Navigator, Scouts, annealed, stopped, train_navigator
 from lt_lib.velocity.noise import Ar1
-from lt_lib.velocity.transfer import BOOSTS, DIRECT
+from lt_lib.velocity.transfer import BOOSTS, DIRECT, require_looks
 
 LAYOUT = load_layout("default")
 FOUR_SDS = 4.0  # of a Monte-Carlo estimate
@@ -265,13 +267,19 @@ def test_opposition_enumerates_every_order_ties_included():
     assert judgements.opposition(np.zeros(7), straight) == (0.0, 1.0)
 
 
-def test_rows_count_coverage_success_and_success_off_the_alternative():
-    entered = np.zeros((1, 4, 2), bool)
-    entered[0, :, 1] = [True, True, False, False]
-    swept = {"entered": entered, "success": np.array([[True, False, True, False]])}
-    assert judgements.count_rows(swept, alternative=1) == [judgements.Row(4, 2, 2, 1)]
-    assert judgements.count_rows(swept, alternative=1)[0].competence == 0.5
-    assert judgements.count_rows(swept, alternative=0)[0].shares == (0.0, 0.5)
+def test_success_off_the_alternative_leaves_out_whoever_entered_it():
+    covered = np.array([[True, True, False, False]])
+    assert judgements.off_alternative(covered, np.array([[True, False, True, False]])) == 0.5
+    assert judgements.off_alternative(covered, ~covered) == 1.0
+    assert np.isnan(judgements.off_alternative(np.ones((1, 4), bool), covered))
+
+
+def test_a_curriculum_is_chosen_by_the_worse_mouth_and_by_commitment_and_not_by_coverage():
+    slab = np.array([[0, 0, 1, 1]])
+    mouths = [{"success": np.array([[1, 1, 1, 1]])}, {"success": np.array([[1, 1, 0, 0]])}]
+    committed, torn = ({"first": np.array([first]), "slab": slab} for first in ([1, 1, 1, 1], [1, 1, 1, 0]))
+    assert judgements.drives_and_commits(committed, mouths) == 0.5
+    assert judgements.drives_and_commits(torn, mouths) == 0.25
 
 
 def test_alternative_success_counts_blocked_incumbents_between_the_edges():
@@ -286,8 +294,11 @@ def test_alternative_success_counts_blocked_incumbents_between_the_edges():
 
 def test_alternative_outcomes_are_those_episodes_and_leave_empty_intervals_out():
     episodes = np.array([(0, 1, 0, 1), (3, 1, 0, 0), (3, 0, 0, 1), (12, 1, 0, 1)])
-    parts = judgements.alternative_outcomes({"episodes": episodes}, 1, (0, 7, 10, 14))
+    parts = judgements.alternative_outcomes([{"episodes": episodes}], [1], (0, 7, 10, 14))
     assert [part.tolist() for part in parts] == [[[True, False]], [[True]]]
+    other = np.array([(0, 0, 0, 1), (12, 0, 1, 0), (13, 0, 1, 1)])  # another incumbent, and fewer early episodes
+    both = judgements.alternative_outcomes([{"episodes": episodes}, {"episodes": other}], [1, 0], (0, 7, 14))
+    assert [part.tolist() for part in both] == [[[True], [True]], [[True], [False]]]
 
 
 def test_the_held_command_is_sideways_travel_over_full_command():
@@ -311,3 +322,49 @@ def test_settings_are_the_paper_s():
     assert RolloutConfig().episodes == claims["cov.episodes"].paper
     assert tuple(DIRECT) == Configuration.__args__ and len(DIRECT) == claims["port.null"].n
     assert {*TABLE_2, *WINDOWED} <= set(claims)
+
+
+# --- looks
+@pytest.mark.parametrize("content", ["floor", "oracle"])
+def test_a_training_kept_at_a_look_equals_one_that_ends_there(weights, content):
+    shared = {"content": content, "starts": "anywhere", "envs": 8, "rollout": 16, "minibatch": 64}
+    longer = train_navigator(NavigatorConfig(**shared, steps=384, looks=(128, 256)), 0, report=quiet, encoder=weights)
+    for look in (128, 256):
+        ended = train_navigator(NavigatorConfig(**shared, steps=look), 0, report=quiet, encoder=weights)
+        kept = stopped(longer, look, look // 128)
+        assert kept.keys() == ended.keys()
+        for name, value in ended.items():
+            np.testing.assert_array_equal(kept[name], value, err_msg=name)
+
+
+def test_a_look_between_updates_is_refused():
+    with pytest.raises(ValidationError, match="multiples of 128 up to 384 control steps, got 200"):
+        NavigatorConfig(envs=8, rollout=16, steps=384, looks=(200,))
+    with pytest.raises(UserError, match=r"navigator.steps: must be one of pretraining.looks \(128, 256\), got 384"):
+        require_looks(NavigatorConfig(envs=8, rollout=16, steps=384), PretrainingConfig(looks=(128, 256)))
+    with pytest.raises(UserError, match=r"pretraining.bit_looks: expected multiples of 128 control steps, got 100"):
+        require_looks(NavigatorConfig(envs=8, rollout=16, steps=128), PretrainingConfig(looks=(128,), bit_looks=(100,)))
+
+
+def test_some_rows_are_observed_as_all_are(encoder):
+    errand = Errand(NavigatorConfig(envs=6, content="oracle"), encoder, np.random.default_rng(0))
+    errand.step(np.tile([1.0, 0.3, 0.0], (6, 1)), 2.0)
+    rows = np.array([4, 1])
+    torch.testing.assert_close(errand.observe(2.0, rows), errand.observe(2.0)[rows], atol=1e-5, rtol=0)
+
+
+def test_contact_and_time_cost_what_the_settings_say_and_contact_ends_an_episode_only_if_it_should(encoder):
+    for ends in (True, False):
+        config = NavigatorConfig(envs=2, hazard=3.0, slab_ends=ends, step_cost=0.25)
+        errand = Errand(config, encoder, np.random.default_rng(0))
+        arena = errand._arena
+        pose = np.array([[0.7, 0.4, 0.0], [-3.0, 0.0, 0.0]])  # just before the left slab, and at the spawn
+        arena.reset(np.ones(2, bool), pose, np.zeros(2, np.int64), np.tile([2.3, 0.0, np.pi], (2, 1)))
+        for _ in range(5):  # pressed against the slab, no distance is gained
+            step = errand.step(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), 1.0)
+            if step.terminated[0]:
+                break
+        assert step.terminated.tolist() == [ends, False]
+        assert step.rewards[1] == pytest.approx(-0.25, abs=1e-4)
+        if not ends:
+            assert step.rewards[0] == pytest.approx(-3.25, abs=0.01)

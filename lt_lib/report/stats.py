@@ -118,26 +118,37 @@ def equivalence(outcomes: Outcomes, reference: Outcomes | float, margin: float) 
 
 
 def mean_above(outcomes: Outcomes, share: float) -> float:
-    """One-sided p that a mean over seeds is greater than `share`: Student's t, exact binomial for a single seed."""
-    if len(outcomes) == 1:
-        return above(int(outcomes.sum()), outcomes.size, share)
-    return float(stats.t.sf((outcomes.mean() - share) / standard_error(outcomes), len(outcomes) - 1))
+    """One-sided p that a mean over seeds is greater than `share`.
+
+    The larger of Student's t over the seeds' shares and of the exact binomial over all episodes, so that neither
+    scattered seeds nor seeds that agree by chance pass; a single seed has its episodes alone.
+    """
+    of_episodes = above(int(outcomes.sum()), outcomes.size, share)
+    return max(of_episodes, _students(outcomes.mean(axis=1) - share)) if len(outcomes) > 1 else of_episodes
 
 
 def mean_below(outcomes: Outcomes, share: float) -> float:
-    """One-sided p that a mean over seeds is smaller than `share`."""
+    """One-sided p that a mean over seeds is smaller than `share`, as `mean_above`."""
     return mean_above(1 - outcomes.astype(int), 1 - share)
 
 
 def mean_less(one: Outcomes, other: Outcomes) -> float:
-    """One-sided p that the first mean over seeds is the smaller: Welch's t, Fisher's exact test for single seeds."""
-    if max(len(one), len(other)) == 1:
-        return fewer(*((int(side.sum()), side.size) for side in (one, other)))
-    variances = np.array([standard_error(side) ** 2 for side in (one, other)])
-    freedom = np.maximum([len(one) - 1, len(other) - 1], 1)
-    total = variances.sum()
-    gap = float(other.mean() - one.mean())
-    return float(stats.t.sf(gap / np.sqrt(total), total**2 / (variances**2 / freedom).sum()))
+    """One-sided p that the first mean over seeds is the smaller.
+
+    The larger of Welch's t over the seeds' shares and of Fisher's exact test over all episodes; single seeds have their
+    episodes alone.
+    """
+    of_episodes = fewer(*((int(side.sum()), side.size) for side in (one, other)))
+    if min(len(one), len(other)) == 1:
+        return of_episodes
+    return max(of_episodes, longer_mean(other.mean(axis=1), one.mean(axis=1)))
+
+
+def _students(values: np.ndarray) -> float:
+    """One-sided p that a mean is above 0; 0 or 1 for values without spread."""
+    if np.ptp(values) < 1e-12:
+        return float(values.mean() <= 0)
+    return float(stats.ttest_1samp(values, 0.0, alternative="greater").pvalue)
 
 
 def drop_test(intact_successes: SupportsIndex, corrupted_successes: SupportsIndex, n: SupportsIndex) -> float:

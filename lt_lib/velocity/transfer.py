@@ -119,7 +119,7 @@ class DirectTransfer:
         kinds = {"navigator": NavigatorConfig, "rollout": RolloutConfig, "pretraining": PretrainingConfig}
         given = {"navigator": navigator, "rollout": rollout, "pretraining": pretraining}
         checked = {name: validated(kind, name, given[name]) for name, kind in kinds.items()}
-        _require_looks(checked["navigator"], checked["pretraining"])
+        require_looks(checked["navigator"], checked["pretraining"])
         shared = {name: getattr(protocol.sizes.head, name) for name in ("layout", "device", "latency")}
         return cls(protocol.store, protocol.encoder_weights(), *(everywhere(each, shared) for each in checked.values()))
 
@@ -293,7 +293,7 @@ class DirectTransfer:
         return Run(roll_navigator, config, seed, {"encoder": self.encoder, "navigator": only(navigator, "navigator")})
 
 
-def _require_looks(navigator: NavigatorConfig, pretraining: PretrainingConfig) -> None:
+def require_looks(navigator: NavigatorConfig, pretraining: PretrainingConfig) -> None:
     """Raises UserError unless the trainings end with an update at every look, and `navigator.steps` is one."""
     update = navigator.envs * navigator.rollout
     if navigator.steps not in pretraining.looks:
