@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from pydantic import ValidationError
 
 from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena, physics_xml
 from lt_lib.envs.camera import FastCamera, colours, network_input
 from lt_lib.envs.fidelity import agreement
 from lt_lib.envs.geodesic import MARGIN, RESOLUTION, RouteDistance
-from lt_lib.envs.layout import Layout, load_layout
+from lt_lib.envs.layout import Layout, Robot, load_layout
 from lt_lib.envs.materials import HAZARD, INDEX
 from lt_lib.envs.occlusion import occlusion, require_occlusion, sight_map
 from lt_lib.envs.reference import ReferenceCamera
@@ -212,6 +213,28 @@ class Straight(FrozenExecutor):
         return np.column_stack([1.0 - route, np.zeros((len(route), 2))])
 
 
+def test_friction_holds_back_a_robot_that_presses_against_a_wall_and_only_it():
+    travelled = {}
+    for name in ("frictionless", "half_friction", "default"):
+        arena = Arena(load_layout(name), 2)
+        pose = np.array([[-3.0, -2.34, 0.0], [-3.0, 0.0, 0.0]])  # beside the right wall, and in the open
+        arena.reset(np.ones(2, bool), pose, np.zeros(2, np.int64), np.tile([2.3, 0.0, np.pi], (2, 1)))
+        for _ in range(6):
+            heading = arena.pose[:, 2]
+            world = np.stack([np.full(2, 0.6), np.array([-0.8, 0.0])], axis=1)  # forward and into the wall
+            body = [
+                np.cos(heading) * world[:, 0] + np.sin(heading) * world[:, 1],
+                np.cos(heading) * world[:, 1] - np.sin(heading) * world[:, 0],
+            ]
+            arena.step(np.column_stack([*body, np.zeros(2)]))
+        travelled[name] = arena.pose[:, 0] + 3.0
+    beside, free = np.array(list(travelled.values())).T  # (layouts,) metres each
+    np.testing.assert_allclose(free, free[0], atol=1e-6)
+    assert abs(beside[0] - free[0]) < 0.02 and beside[1:].max() < 0.8 * free[0]
+    with pytest.raises(ValidationError, match="greater than or equal to 0"):
+        Robot(radius=0.15, height=0.4, friction=-1.0)
+
+
 def test_arrival_slab_contact_and_time_out_are_told_apart(layout):
     draws = draw_scenes(layout, 3, np.random.default_rng(0))
     draws.spawn[:] = [[4.5, 0.0, 0.0], [0.4, 0.4, 0.0], [4.5, 0.0, 0.0]]
@@ -351,7 +374,7 @@ def test_a_file_that_is_no_layout_gives_one_clear_line(text, tmp_path):
 
 
 def test_an_unknown_layout_is_named_with_the_known_ones():
-    with pytest.raises(UserError, match=r"^unknown layout 'defualt'; known: default, grid, grid_peek, leaking"):
+    with pytest.raises(UserError, match=r"^unknown layout 'defualt'; known: default, frictionless, grid, grid_peek, half_friction, leaking"):
         load_layout("defualt")
 
 
