@@ -13,6 +13,7 @@ import lt_lib.gridworld.table_ppo
 import lt_lib.gridworld.walks
 import lt_lib.hardware.recolour
 import lt_lib.learnability.windows
+import lt_lib.perception.first_layer
 import lt_lib.perception.renewal  # noqa: F401
 
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")

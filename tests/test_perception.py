@@ -4,8 +4,11 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
+from lt_lib.envs.camera import network_input
 from lt_lib.envs.layout import load_layout
+from lt_lib.envs.materials import PALETTE
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, architecture
 from lt_lib.perception.frames import hazard_visible, random_rollouts
 from lt_lib.perception.gates import GateError, effective_rank, encode, require_gates
@@ -15,6 +18,7 @@ from lt_lib.preflight import check_inputs, settled
 from lt_lib.settings.base import UserError
 from lt_lib.settings.perception import EncoderConfig, Gates
 from lt_lib.store.files import content_digest
+from lt_lib.store.states import restored
 
 PASSED = {"hazard": 0.95, "majority": 0.8, "walls": 0.97, "rank": 50.0}
 
@@ -68,6 +72,20 @@ def test_training_is_a_pure_function_that_lowers_the_loss_and_fixes_the_normalis
 
 def test_architecture_is_the_paper_s():
     assert architecture(Encoder()) == "conv 32,64,64 kernels 8,4,3 strides 4,2,1 linear 64"
+
+
+def test_the_first_convolution_by_tables_equals_torch_s_on_rendered_frames_and_on_noise(trained):
+    rng = np.random.default_rng(1)
+    rendered = random_rollouts(load_layout("default"), 32, 2, rng).frames[:, 0]
+    noise = rng.integers(0, len(PALETTE), rendered.shape).astype(np.uint8)  # no run is longer than a few pixels
+    plain = np.repeat(np.arange(len(PALETTE), dtype=np.uint8), 64 * 64).reshape(-1, 64, 64)  # every window one colour
+    encoder, frozen = restored(Encoder(), trained, "E"), FrozenEncoder(trained)
+    for frames in (rendered, noise, plain):
+        with torch.no_grad():
+            expected = encoder.layers[0](torch.from_numpy(network_input(frames)).permute(0, 3, 1, 2))
+        torch.testing.assert_close(frozen.inputs(frames), expected, atol=1e-5, rtol=1e-5)
+    alone = torch.cat([frozen.inputs(rendered[i : i + 1]) for i in range(4)])
+    assert torch.equal(alone, frozen.inputs(rendered[:4]))  # whatever is computed beside a frame
 
 
 def test_bfloat16_latents_stay_near_the_reference(trained):

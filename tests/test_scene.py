@@ -374,7 +374,10 @@ def test_a_file_that_is_no_layout_gives_one_clear_line(text, tmp_path):
 
 
 def test_an_unknown_layout_is_named_with_the_known_ones():
-    with pytest.raises(UserError, match=r"^unknown layout 'defualt'; known: default, frictionless, grid, grid_peek, half_friction, leaking"):
+    with pytest.raises(
+        UserError,
+        match=r"^unknown layout 'defualt'; known: default, frictionless, grid, grid_peek, half_friction, leaking",
+    ):
         load_layout("defualt")
 
 

@@ -6,7 +6,7 @@ MuJoCo's own renderer behind the same call.
 """
 
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 
 from lt_lib.envs.layout import SIDES, Layout
 from lt_lib.envs.materials import GOAL_PILLAR, INDEX, PALETTE
@@ -65,14 +65,7 @@ def network_input(
     frames: UInt8[np.ndarray, "b h w"], palette: UInt8[np.ndarray, "colours 3"] = PALETTE
 ) -> Float[np.ndarray, "b h w 3"]:
     """Colours divided by 255, (B, H, W, 3) float32: the input scaling of the encoder and of the raw message."""
-    return looked_up(frames, palette.astype(np.float32) / np.float32(255))
-
-
-def looked_up(
-    frames: UInt8[np.ndarray, "b h w"], table: Shaped[np.ndarray, "colours 3"]
-) -> Shaped[np.ndarray, "b h w 3"]:
-    """The row of `table` that each pixel selects, in the table's own type."""
-    out = np.empty((*frames.shape, 3), table.dtype)
-    red, green, blue = np.ascontiguousarray(table.T)  # (colours,) each
+    out = np.empty((*frames.shape, 3), np.float32)
+    red, green, blue = np.ascontiguousarray(palette.T.astype(np.float32) / np.float32(255))  # (colours,) each
     expand(frames.reshape(-1), red, green, blue, out.reshape(-1, 3))
     return out

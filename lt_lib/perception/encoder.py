@@ -6,14 +6,14 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from lt_lib.envs.camera import looked_up
 from lt_lib.envs.materials import PALETTE
+from lt_lib.perception.first_layer import bags
 from lt_lib.store.states import restored
 
 LATENT = 64
 ACTION = 3
-BITS = {torch.float32: torch.int32, torch.bfloat16: torch.int16}
 CHUNK = 1024  # most observations encoded at once
 
 
@@ -97,16 +97,36 @@ class Frozen:
 class FrozenEncoder(Frozen):
     """The frozen form for the fast camera's frames (B, H, W) of palette indices.
 
-    precision  'float32', the reference, or 'bfloat16', faster on CPUs that support it
+    The first convolution is a sum of table rows (`perception.first_layer`), in float32 and on the CPU.
+
+    precision  of what follows it: 'float32', the reference, or 'bfloat16', faster on CPUs that support it
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu", precision: str = "float32"):
         super().__init__(Encoder(), weights, device, precision)
-        scaled = torch.from_numpy(PALETTE.astype(np.float32) / np.float32(255)).to(self.dtype)  # (colours, 3)
-        self._table = scaled.view(BITS[self.dtype]).numpy()  # numpy has no bfloat16
+        first, self._encoder = self._encoder.layers[0], self._encoder.layers[1:]
+        self._size, self._stride = first.kernel_size[0], first.stride[0]
+        self._table = run_table(weights["E.layers.0.weight"], weights["E.layers.0.bias"])
 
-    def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b h w 3"]:
-        return torch.from_numpy(looked_up(observations, self._table)).view(self.dtype).to(self.device)
+    def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b c j j"]:
+        """The first convolution's outputs, channels last in memory."""
+        places = (observations.shape[1] - self._size) // self._stride + 1
+        windows = len(observations) * places**2
+        rows, starts = np.empty(windows * (self._size**2 + 1), np.int32), np.empty(windows + 1, np.int32)
+        n = bags(observations, self._size, self._stride, len(PALETTE), rows, starts)
+        picked = torch.from_numpy(rows[:n]), self._table, torch.from_numpy(starts)
+        out = F.embedding_bag(*picked, mode="sum", include_last_offset=True)  # (windows, c)
+        return out.view(-1, places, places, out.shape[1]).permute(0, 3, 1, 2).to(self.device, self.dtype)
+
+
+def run_table(weight: Float[np.ndarray, "c 3 k k"], bias: Float[np.ndarray, " c"]) -> Float[Tensor, "rows c"]:
+    """What every run of one palette colour in a window adds to the first convolution; see `first_layer.bags`."""
+    scaled = PALETTE.astype(np.float64) / 255
+    pixel = np.einsum("oryx,cr->xyco", weight.astype(np.float64), scaled)  # (k, k, colours, c), the column first
+    below = np.concatenate([np.zeros_like(pixel[:, :1]), pixel.cumsum(axis=1)], axis=1)  # (k, k + 1, colours, c)
+    runs = below[:, None, 1:] - below[:, :-1, None]  # (k, y0, y1 - 1, colours, c)
+    parts = runs.reshape(-1, len(bias)), pixel.sum(axis=(0, 1)) + bias, bias[None]
+    return torch.from_numpy(np.concatenate(parts).astype(np.float32))
 
 
 def in_chunks(encode: Callable[[np.ndarray], Tensor], observations: np.ndarray) -> Float[np.ndarray, "n 64"]:

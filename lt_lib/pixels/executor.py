@@ -141,7 +141,7 @@ def train_executor(
         policy = Executor().to(device)
     generator = torch.Generator(device).manual_seed(seed)
     driving = Driving(load_layout(config.layout), FrozenEncoder(encoder, device, config.precision), config.envs, rng)
-    optimiser = torch.optim.Adam(policy.parameters(), lr=config.lr, eps=1e-5)
+    optimiser = torch.optim.Adam(policy.parameters(), lr=config.lr, eps=1e-5, fused=True)
     updates = max(1, config.steps // (config.rollout * config.envs))
     curves, kept = [], {}
     for i in range(updates):

@@ -250,7 +250,7 @@ def train_redrawn_head(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         head = RouteHead(ANCHOR + CONTENT)
-    optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5)
+    optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     episodes, updates = [], []
     for start in range(0, config.episodes, config.batch):
         n = min(config.batch, config.episodes - start)

@@ -192,7 +192,7 @@ def train_navigator(
         navigator = read_navigator(start) if start else Navigator()
     errand = Errand(config, FrozenEncoder(encoder, config.device, config.precision), rng)
     chains = Ar1(np.full(config.envs, config.boost.tau), rng)
-    optimiser = torch.optim.Adam(navigator.parameters(), lr=config.lr, eps=1e-5)
+    optimiser = torch.optim.Adam(navigator.parameters(), lr=config.lr, eps=1e-5, fused=True)
     updates = max(1, config.steps // (config.rollout * config.envs))
     episodes, sigmas, boosts, kept = [], [], [], {}
     for i in range(updates):
