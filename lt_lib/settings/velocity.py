@@ -75,9 +75,9 @@ class PretrainingConfig(Settings):
         98_304, 131_072, 163_840, 196_608, 229_376, 262_144, 294_912, 327_680,
     )  # fmt: skip
     seeds: PositiveInt = 3
-    episodes: PositiveInt = 48  # per row of Table II and seed at each look
+    episodes: PositiveInt = 32  # per row and seed at each look, and wherever a picture needs no more
     boosted: PositiveInt = 80  # iterations of further training with the boost
-    bit_looks: tuple[PositiveInt, ...] = (131_072, 262_144, 524_288)  # of navigators that are told the bit
+    bit_looks: tuple[PositiveInt, ...] = (131_072, 262_144, 393_216)  # of navigators that are told the bit
 
     @model_validator(mode="after")
     def _in_order(self) -> "PretrainingConfig":

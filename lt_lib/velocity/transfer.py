@@ -59,7 +59,6 @@ BOOSTS = MappingProxyType(
     {
         "annealed": Boost(first=6.2, last=3.6, at=80),
         "held": Boost(first=6.2, last=6.2, at=80),
-        "none": Boost(),
     }
 )
 EARLY, LATE = (0, 14, 28), (66, 73, 80)  # edges of the iterations over which the paper's two ranges are measured
@@ -151,10 +150,13 @@ class DirectTransfer:
         }
 
     def told(self, seeds: int) -> dict[str, list[Result]]:
-        """Navigators told the oracle's bit, by what else is changed (BITS), with their weights at every look."""
+        """Navigators told the oracle's bit, by what else is changed (BITS), with their weights at every look.
+
+        seeds  of the oracle as it is; each change has one
+        """
         looks = self.bit_looks
         changes = {name: BITS[name] | {"steps": looks[-1], "looks": looks} for name in BITS}
-        return self._trained(changes, dict.fromkeys(BITS, seeds), "navigators that are told the bit")
+        return self._trained(changes, {name: seeds if name == ORACLE else 1 for name in BITS}, "told the bit")
 
     @property
     def bit_looks(self) -> tuple[int, ...]:
@@ -162,19 +164,26 @@ class DirectTransfer:
         return tuple(sorted({*self.pretraining.bit_looks, self.navigator.steps}))
 
     def grown(self, pretrained: Mapping[str, list[Result]]) -> Examined:
-        """Plays the navigators of every curriculum after the last look, as `examined` does."""
+        """Plays the navigators of every curriculum after the last look, as `examined` does but without greedy rows."""
         last = self.pretraining.looks[-1]
-        return self.examined({name: [after(each, last) for each in trained] for name, trained in pretrained.items()})
+        kept = {name: [after(each, last) for each in trained] for name, trained in pretrained.items()}
+        return self._played(kept, (SAMPLED,), self.pretraining.episodes)
 
     def examined(self, navigators: Mapping[str, list[Result]]) -> Examined:
         """Plays the frozen navigators from the spawn, and from in front of either mouth.
 
-        From the spawn, each navigator gets its own random draws of the scene; in all other cases all get the same.
+        From the spawn, each navigator gets its own random draws of the scene; from the mouths all get the same.
         """
+        return self._played(navigators, (SAMPLED, GREEDY), self.rollout.episodes)
+
+    def _played(self, navigators: Mapping[str, list[Result]], rows: tuple[Exploration, ...], episodes: int) -> Examined:
         everyone = [(name, navigator) for name, results in navigators.items() for navigator in results]
-        spawn = [self._roll(self._rollout(n, rows=(SAMPLED, GREEDY)), r, seed) for seed, (n, r) in enumerate(everyone)]
+        spawn = [
+            self._roll(self._rollout(n, rows=rows, episodes=episodes), r, seed) for seed, (n, r) in enumerate(everyone)
+        ]
+        brief = {"rows": (SAMPLED,), "episodes": self.pretraining.episodes}
         mouths = [
-            self._roll(self._rollout(n, rows=(SAMPLED,), start=side, blocked=other), r)
+            self._roll(self._rollout(n, start=side, blocked=other, **brief), r)
             for n, r in everyone
             for side, other in (SIDES, SIDES[::-1])
         ]
@@ -222,7 +231,7 @@ class DirectTransfer:
         }
 
     def boosted(self, starts: Sequence[Result]) -> dict[str, list[Result]]:
-        """Trains silent navigators further with the bit: all with the annealed boost, the first with each other one."""
+        """Trains silent navigators further with the bit: all with the annealed boost, and the first with a held one."""
         runs = {
             (name, seed): Run(
                 train_navigator,
