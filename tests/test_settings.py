@@ -2,6 +2,7 @@
 
 import ast
 
+import numpy as np
 import pytest
 
 from lt_lib.gridworld.protocol import GridProtocol
@@ -19,18 +20,23 @@ from lt_lib.velocity.transfer import DirectTransfer
 from run_all import code_cells
 
 PROFILES = ("full", "quick")
+# what the velocity study reads of a navigator's training and of its episodes
+PLAYED = {
+    "episodes": np.zeros((0, 4), int), "sigma": np.ones((0, 3)), "boost": np.ones(0),
+    "first": np.zeros((2, 4), int), "slab": np.tile([0, 1], (2, 2)),
+}  # fmt: skip
 OTHER = {"layout": "wide", "latency": 3}  # neither is a default
 
 
 class Recorder:
     """A run store that computes nothing and remembers what it was asked for."""
 
-    def __init__(self):
-        self.runs = []
+    def __init__(self, **result):
+        self.runs, self.result = [], result
 
     def fetch(self, runs, what):
         self.runs += runs
-        return [{} for _ in runs]
+        return [dict(self.result) for _ in runs]
 
     def configs(self, function: str) -> list[Settings]:
         found = [run.config for run in self.runs if run.function.__name__ == function]
@@ -108,7 +114,10 @@ def test_every_gridworld_setting_of_a_profile_reaches_its_runs(profile):
     gridworld, store = given["gridworld"] | {"layout": "grid_peek", "latency": 3}, Recorder()
     protocol = with_store(GridProtocol.of(gridworld, 0), store)
     protocol.gate_reports(protocol.encoders())
-    protocol.corrupted(protocol.trained(gridworld["seeds"], {}), 7, {})
+    encoder = {"mean": np.full(64, 5.0), "std": np.full(64, 2.0)}
+    protocol.corrupted(protocol.trained(gridworld["seeds"], encoder), 7, encoder)
+    entered = GridProtocol.of(gridworld | {"scaled": "none"}, 0).frozen(encoder)  # the form that is not the default
+    assert protocol.scaled == gridworld.get("scaled", "each") and entered["mean"].max() == 0
     assert_arrives(gridworld["encoder"], store.configs("train_patch_encoder"), "encoder")
     assert_arrives(gridworld["policy"], store.configs("train_grid"), "policy")
     assert {name: getattr(protocol.gates, name) for name in gridworld["gates"]} == gridworld["gates"]
@@ -119,14 +128,25 @@ def test_every_gridworld_setting_of_a_profile_reaches_its_runs(profile):
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_velocity_setting_of_a_profile_reaches_its_runs(profile):
-    given, store = load_profile(profile)["05_coverage_sweep"], Recorder()
+    given, store = load_profile(profile)["05_coverage_sweep"], Recorder(**PLAYED)
     pixels = PixelProtocol.of({"latency": 3}, "wide", "cpu", 0)
     object.__setattr__(pixels, "encoder_weights", dict)
-    study = with_store(DirectTransfer.of(pixels, given["navigator"], given["rollout"]), store)
-    study.examined(study.navigators(given["configurations"], given["oracle_seeds"]))
+    sections = (given[name] for name in ("navigator", "rollout", "pretraining"))
+    study, asked = with_store(DirectTransfer.of(pixels, *sections), store), given["pretraining"]
+    pretrained, told = study.pretrained(), study.told(given["oracle_seeds"])
+    study.examined(study.navigators(given["configurations"], pretrained, told["oracle"]))
+    study.grown(pretrained)
     assert_arrives(given["navigator"], store.configs("train_navigator"), "navigator")
     assert_arrives(given["rollout"], store.configs("roll_navigator"), "rollout")
+    assert any(config.episodes == asked["episodes"] for config in store.configs("roll_navigator"))
+    assert any(config.looks == tuple(asked["looks"]) for config in store.configs("train_navigator"))
+    assert {*asked["bit_looks"]} <= {*study.bit_looks}
+    assert all(len(seeds) == asked["seeds"] for seeds in pretrained.values())
+    assert len(study.at_looks(pretrained[asked["curriculum"]])) == len(asked["looks"])
     assert_shared_everywhere(store)
+    study.boosted([{}])
+    lengths = {config.steps for config in store.configs("train_navigator") if config.boost.first > 1}
+    assert lengths == {study.pretraining.boosted * study.navigator.envs * study.navigator.rollout}
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -137,12 +157,16 @@ def test_every_hardware_setting_of_a_profile_reaches_its_runs(profile):
     protocol = with_store(HardwareProtocol.of(gates, 0, "cpu", "", given["simulated"], **sections), store)
     protocol.gate_reports(protocol.encoders())
     protocol._films()
-    protocol.after_selection(next(iter(gates.candidates)), {}, given["encoder_seeds"])
+    protocol.after_selection(next(iter(gates.candidates)), {}, given["encoder_seeds"], given["lengths"])
     protocol.sweeps(given["effects"], given["sweep"])
     assert_arrives(given["matched"], store.configs("train_matched_encoder"), "matched")
     assert_arrives(given["cheap"], store.configs("train_matched_encoder"), "cheap")
     assert_arrives(given["checks"], store.configs("measure_matched_gates"), "checks")
-    assert_arrives(given["executor"], store.configs("train_executor"), "executor")
+    driving = given["executor"] | {"steps": max(given["lengths"])}  # kept at `executor.steps` on its way
+    assert_arrives(driving, store.configs("train_executor"), "executor")
+    assert store.configs("train_executor")[0].looks == tuple(given["lengths"])
+    with pytest.raises(UserError, match="lengths: expected multiples of 8192 control steps"):
+        protocol.after_selection(next(iter(gates.candidates)), {}, 1, [8192])
     assert_arrives(given["sweep"] | {"effect": given["effects"][0]}, store.configs("film_sweep"), "sweep")
     for session in given["sessions"].values():
         assert_arrives(session, store.configs("film_session"), "sessions")

@@ -27,6 +27,13 @@ class Inferred(Settings):
     rule: Literal["nearest", "largest"]
     predicts: Annotated[tuple[str, ...], Field(min_length=1)]
 
+    def __str__(self) -> str:
+        rows = f"calibrated on {', '.join(self.calibrates)}" if self.calibrates else "calibrated on no row of the paper"
+        return (
+            f"{self.setting}: {self.what}\n  measure: {self.measure}\n  rule: {self.rule} {self.target}, {rows}\n"
+            f"  predicts: {', '.join(self.predicts)}"
+        )
+
     def choose(self, measured: Mapping[Any, float | Sequence[float]]) -> Any:
         """The value that the rule picks from what was measured for each value tried; the first of equals.
 
