@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 import traceback
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,9 +28,11 @@ from unittest import mock
 
 from lt_lib.preflight import check_cluster, check_inputs, check_opengl, settled
 from lt_lib.settings.base import ROOT, UserError
-from lt_lib.settings.profiles import load_profile, notebook_defaults, notebook_names
+from lt_lib.settings.profiles import GIVEN, load_profile, notebook_defaults, notebook_names
+from lt_lib.store import journal
 from lt_lib.store.files import claimed, runs_folder, writable_folder
-from lt_lib.store.manifest import stages_since, write_manifest
+from lt_lib.store.local import cores
+from lt_lib.store.manifest import computed_since, write_manifest
 from lt_lib.store.progress import Progress, read_progress
 
 # Without these the notebook can only fail too; the scoreboard joins whatever is there.
@@ -40,8 +43,6 @@ NEEDS = {
     "07_corruption": ("03_gridworld", "04_pixels"),
     "10_speed": ("03_gridworld", "04_pixels"),
 }
-# What this script gives to every notebook, overriding the profile.
-GIVEN = ("profile", "outputs", "workers")
 # Parameters naming things that may be missing or unfit; checked before computing.
 INPUTS = ("device", "layout", "weights", "seeds", "gridworld", "peek_layout", "frames", "effects", "gate_file")
 # A notebook whose code calls this draws with OpenGL.
@@ -71,12 +72,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a notebook went: 'ok', 'FAILED' or 'skipped', seconds, the reason in one line, what was computed for it."""
+    """How a notebook went: 'ok', 'FAILED' or 'skipped', seconds, the reason in one line, what was computed for it.
+
+    computed: as from `store.manifest.computed_since`
+    """
 
     status: str
     seconds: float
     reason: str = ""
-    stages: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    computed: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Parser(argparse.ArgumentParser):
@@ -135,9 +139,10 @@ def ended_by_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def kernels_environment(plan: Plan) -> Iterator[None]:
-    """The notebooks' environment: this library, the folder of runs, no backend (figures need none)."""
+    """The notebooks' environment: this library, the folder of runs, who asks for them, no backend (none is needed)."""
     library = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    with mock.patch.dict(os.environ, {"LT_RUNS": str(plan.runs), "PYTHONPATH": library}):
+    ours = {"LT_RUNS": str(plan.runs), "PYTHONPATH": library, journal.ASKED_BY: uuid.uuid4().hex}
+    with mock.patch.dict(os.environ, ours):
         os.environ.pop("MPLBACKEND", None)
         yield
 
@@ -213,6 +218,8 @@ def preflight(plan: Plan) -> None:
         check_opengl()
     if plan.scheduler:
         check_cluster(plan.scheduler)
+    else:
+        cores()
     kept = [plan.outputs / name for name in ("logs", "notebooks", "results")]
     for folder in (plan.outputs, *kept):
         writable_folder(folder)
@@ -229,7 +236,9 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
         outcomes[name] = Outcome("skipped", 0.0, f"needs {failed[0]}") if failed else execute(plan, name)
         outcome = outcomes[name]
         print(f"{name:20}{outcome.status:8}{clock(outcome.seconds):>8}  {outcome.reason}".rstrip(), flush=True)
-        entry = {"status": outcome.status, "seconds": round(outcome.seconds, 1), "stages": outcome.stages}
+        if len(outcome.computed.get("computers", ())) > 1:
+            print(f"{name:20}results of several kinds of computers: {'; '.join(outcome.computed['computers'])}")
+        entry = {"status": outcome.status, "seconds": round(outcome.seconds, 1), **outcome.computed}
         write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, {name: entry})
     if "09_scoreboard" in outcomes and outcomes["09_scoreboard"].status == "ok":
         from lt_lib.report.html import write_report  # takes seconds, which bad input need not wait for
@@ -244,8 +253,7 @@ def execute(plan: Plan, name: str) -> Outcome:
     log = plan.outputs / "logs" / f"{name}.log"
     results = plan.outputs / "results" / f"{name}.json"
     before = results.stat().st_mtime_ns if results.exists() else None
-    journal = plan.runs / "journal.jsonl"
-    started, computed = time.monotonic(), journal.stat().st_size if journal.exists() else 0
+    started, computed = time.monotonic(), journal.length(plan.runs)
     with log.open("w", encoding="utf-8") as file, live_line(name, plan.runs):
         reason = edited(plan, name) or run_papermill(plan, name, file)
     if not reason and (not results.exists() or results.stat().st_mtime_ns == before):
@@ -253,7 +261,8 @@ def execute(plan: Plan, name: str) -> Outcome:
     reason = reason or edited(plan, name)
     if reason:
         reason = f"{reason} (log: {shown(log, plan.root)})"
-    return Outcome("FAILED" if reason else "ok", time.monotonic() - started, reason, stages_since(journal, computed))
+    made = computed_since(plan.runs, computed, os.environ[journal.ASKED_BY])
+    return Outcome("FAILED" if reason else "ok", time.monotonic() - started, reason, made)
 
 
 def edited(plan: Plan, name: str) -> str:
@@ -277,7 +286,7 @@ def run_papermill(plan: Plan, name: str, log: TextIO) -> str:
         with contextlib.chdir(plan.root), stderr_into(log):
             papermill.execute_notebook(
                 f"notebooks/{name}.ipynb",
-                shown(executed, plan.root),
+                literal(shown(executed, plan.root)),
                 dict(plan.parameters[name]),
                 kernel_name="python3",
                 kernel_manager_class=OwnKernel,
@@ -358,6 +367,11 @@ def clock(seconds: float) -> str:
 def shown(path: Path, root: Path) -> str:
     """A path, relative to the project's root if it lies inside."""
     return str(path.relative_to(root) if path.is_relative_to(root) else path)
+
+
+def literal(path: str) -> str:
+    """A path for papermill, which would fill in parameters between braces."""
+    return path.replace("{", "{{").replace("}", "}}")
 
 
 def first_line(text: str) -> str:

@@ -15,7 +15,8 @@ from toy_runs import ToyConfig, train_toy
 from lt_lib.settings import profiles
 from lt_lib.settings.base import Settings, UserError
 from lt_lib.settings.profiles import explain, load_profile
-from lt_lib.store.manifest import stages_since
+from lt_lib.store import journal as journal_file
+from lt_lib.store.manifest import computed_since
 from lt_lib.store.progress import Progress
 from run_all import choose, clock, describe, main
 
@@ -318,13 +319,21 @@ def test_interrupted_it_says_so_and_leaves_nothing_running(project, how, status)
     assert line.startswith("run_all: interrupted; finished runs are kept")
 
 
-def test_stages_are_the_runs_that_the_journal_gained(tmp_path):
-    journal = tmp_path / "journal.jsonl"
-    assert stages_since(journal, 0) == {}
-    spent = (("train", 1.2), ("roll", 2.0), ("train", 3.0))
-    lines = [{"function": name, "seconds": seconds} for name, seconds in spent]
-    journal.write_text("".join(json.dumps(line) + "\n" for line in lines[:1]))
-    before = journal.stat().st_size
-    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert stages_since(journal, before) == {"roll": {"runs": 1, "seconds": 2.0}, "train": {"runs": 1, "seconds": 3.0}}
-    assert stages_since(journal, 0)["train"] == {"runs": 2, "seconds": 4.2}
+def test_stages_are_the_runs_that_the_journal_gained_for_whoever_asks(tmp_path, monkeypatch, caplog):
+    assert computed_since(tmp_path, 0, "us") == {"stages": {}, "computers": []}
+    monkeypatch.setenv(journal_file.ASKED_BY, "us")
+    journal_file.append(tmp_path, {"function": "train", "seconds": 1.2})
+    before = journal_file.length(tmp_path)
+    journal_file.append(tmp_path, {"function": "roll", "seconds": 2.0})
+    monkeypatch.setenv(journal_file.ASKED_BY, "another run_all.py on the same store")
+    journal_file.append(tmp_path, {"function": "train_point_mass", "seconds": 9.0})
+    monkeypatch.setenv(journal_file.ASKED_BY, "us")
+    with (tmp_path / journal_file.JOURNAL).open("a") as file:
+        file.write('{"function": "train", "sec')  # the disk was full
+    journal_file.append(tmp_path, {"function": "train", "seconds": 3.0})
+    journal_file.append(tmp_path, {"fetched": "heads", "computers": ["AMD EPYC", "Intel Xeon"]})
+    made = computed_since(tmp_path, before, "us")
+    assert made["stages"] == {"roll": {"runs": 1, "seconds": 2.0}, "train": {"runs": 1, "seconds": 3.0}}
+    assert made["computers"] == ["AMD EPYC", "Intel Xeon"]
+    assert computed_since(tmp_path, 0, "us")["stages"]["train"] == {"runs": 2, "seconds": 4.2}
+    assert "has a line that was cut short; it is skipped" in caplog.text

@@ -29,7 +29,7 @@ def toys(count, config=SLOW):
 
 
 def journal_keys(folder: Path) -> list[str]:
-    return [json.loads(line)["key"] for line in (folder / "journal.jsonl").read_text().splitlines()]
+    return [json.loads(line)["key"] for line in (folder / "journal.jsonl").read_text().splitlines() if "key" in line]
 
 
 def kept_files(folder: Path) -> dict[str, bytes]:

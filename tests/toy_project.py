@@ -69,7 +69,8 @@ def start(root: Path) -> subprocess.Popen:
 
 def journal(root: Path) -> list[dict]:
     path = root / "outputs" / "runs" / "journal.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return [line for line in lines if "key" in line]  # of runs, not of fetches
 
 
 def wait_until(condition, seconds: float) -> None:

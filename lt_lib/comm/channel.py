@@ -77,6 +77,10 @@ class Channel:
         arrived = torch.from_numpy(self._sent_at[slot, rows] == sent_at).reshape(-1, *others, 1)
         return wire * (arrived & heard(offset)[..., None])
 
+    def forget(self) -> None:
+        """Loses whatever is in flight: a new episode begins."""
+        self._sent_at[:] = NEVER
+
     def _slots(self, step, rows) -> tuple[np.ndarray, np.ndarray]:
         rows = np.arange(self._sent_at.shape[1]) if rows is None else rows
         return np.zeros_like(rows) + step % (self.latency + 1), rows

@@ -22,6 +22,7 @@ from lt_lib.envs.arena import CONTROL_HZ, HORIZON, NO_CORRIDOR, Arena
 from lt_lib.envs.camera import FastCamera, colours
 from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.envs.reference import TopView
+from lt_lib.settings.base import UserError
 
 ARRIVAL_REWARD = 1.0
 CONTACT_REWARD = -0.01  # per control step in contact with the slab
@@ -35,6 +36,20 @@ def frame_space(layout: Layout) -> Box:
 def velocity_space() -> Box:
     """(vx, vy, omega) in the body's frame; 1 is 0.5 m/s and 1.5 rad/s."""
     return Box(-1, 1, (3,), np.float32)
+
+
+def finite(what: str, values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Values as floats. Raises UserError unless they are finite and have the shape, whose first axis counts rows."""
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{what}: expected numbers of shape {shape}, got {type(values).__name__}") from None
+    if array.shape != shape:
+        raise UserError(f"{what}: expected shape {shape}, got {array.shape}")
+    wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
+    if len(wrong):
+        raise UserError(f"{what} of environment {wrong[0]}: expected finite numbers, got {array[wrong[0]].tolist()}")
+    return array
 
 
 class Scenes:
@@ -58,13 +73,26 @@ class Scenes:
         self.entered[which], self._age[which] = NO_CORRIDOR, 0
 
     def step(self, action: np.ndarray):
-        """One control step; action (n, 3). Returns reward, terminated (arrived) and truncated (time-out), each (n,)."""
-        self.arena.step(np.asarray(action, np.float64))
+        """One control step; action (n, 3). Returns reward, terminated (arrived) and truncated (time-out), each (n,).
+
+        Raises UserError, with the environment's index, for an action of another shape or one that is not finite.
+        """
+        self.arena.step(finite("action", action, (self.arena.n, *velocity_space().shape)))
         self._age += 1
         self.entered = np.where(self.entered == NO_CORRIDOR, self.arena.corridor, self.entered)
         reached = self.arena.reached
         reward = ARRIVAL_REWARD * reached + CONTACT_REWARD * self.arena.contact
         return reward, reached, ~reached & (self._age >= HORIZON)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What copies and other processes need: the scene and every number that the next step depends on."""
+        kept = {"entered": self.entered, "age": self._age, "arena": self.arena.state()}
+        return kept | {"layout": self.arena.layout.model_dump(mode="json")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(Layout(**state["layout"]), len(state["age"]))
+        self.entered, self._age = state["entered"].copy(), state["age"].copy()
+        self.arena.restore(state["arena"])
 
     def navigator_frames(self) -> UInt8[np.ndarray, "n h w 3"]:
         return colours(self._camera.frames(self.arena.pose, self.arena.slab, self.arena.scout[:, :2]))
@@ -83,6 +111,11 @@ class Scenes:
     def seen_by(self, view: TopView) -> UInt8[np.ndarray, "h w 3"]:
         """The only row, seen from above."""
         return view.picture(self.arena.pose[0], int(self.arena.slab[0]), self.arena.scout[0])
+
+
+def _one(action: Any) -> Any:
+    """The action of a single environment as a batch of one."""
+    return np.asarray(action)[None]
 
 
 class ArenaEnv(gymnasium.Env):
@@ -106,7 +139,7 @@ class ArenaEnv(gymnasium.Env):
         return self._scenes.navigator_frames()[0], self._scenes.info()
 
     def step(self, action: Float[np.ndarray, "3"]):
-        reward, terminated, truncated = self._scenes.step(action[None])
+        reward, terminated, truncated = self._scenes.step(_one(action))
         frame = self._scenes.navigator_frames()[0]
         return frame, reward.item(), terminated.item(), truncated.item(), self._scenes.info()
 

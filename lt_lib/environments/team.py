@@ -15,7 +15,7 @@ from pettingzoo import ParallelEnv
 
 from lt_lib.comm.channel import ANCHOR, Channel
 from lt_lib.comm.messages import CONTENT
-from lt_lib.environments.gym import Scenes, frame_space, velocity_space
+from lt_lib.environments.gym import Scenes, finite, frame_space, velocity_space
 from lt_lib.envs.arena import CONTROL_HZ
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.reference import TopView
@@ -51,7 +51,7 @@ class TeamEnv(ParallelEnv):
         }
         self.action_spaces = {NAVIGATOR: velocity_space(), SCOUT: Box(-np.inf, np.inf, (content,), np.float32)}
         self._wire, self._age = np.zeros(wire.shape, np.float32), 0
-        self._channel = lambda: Channel((1,), content, scene.communication_radius, latency)
+        self._in_flight = Channel((1,), content, scene.communication_radius, latency)
         self.render_mode = render_mode
         self._view = TopView(scene) if render_mode else None
 
@@ -67,15 +67,18 @@ class TeamEnv(ParallelEnv):
             self._rng = np.random.default_rng(seed)
         self._scenes.restart(np.ones(1, bool), [self._rng])
         self.agents = list(self.possible_agents)
-        self._wire, self._age, self._in_flight = np.zeros_like(self._wire), 0, self._channel()
+        self._wire, self._age = np.zeros_like(self._wire), 0
+        self._in_flight.forget()
         return self._observe(), self._each(self._scenes.info())
 
     def step(self, actions: dict[str, np.ndarray]):
         if not self.agents:
             return {}, {}, {}, {}, {}
-        arena, message = self._scenes.arena, torch.as_tensor(actions[SCOUT], dtype=torch.float32)
-        self._in_flight.send(self._age, message[None], arena.scout[:, :2])
-        reward, terminated, truncated = self._scenes.step(actions[NAVIGATOR][None])
+        self._require(actions)
+        (content,) = self.action_spaces[SCOUT].shape
+        arena, message = self._scenes.arena, finite("message", np.asarray(actions[SCOUT])[None], (1, content))
+        self._in_flight.send(self._age, torch.from_numpy(message).float(), arena.scout[:, :2])
+        reward, terminated, truncated = self._scenes.step(np.asarray(actions[NAVIGATOR])[None])
         self._age += 1
         self._wire = self._in_flight.receive(self._age, arena.pose[:, :2])[0].numpy()
         told = self._observe(), *map(self._each, (reward.item(), terminated.item(), truncated.item()))
@@ -83,6 +86,12 @@ class TeamEnv(ParallelEnv):
         if terminated or truncated:
             self.agents = []
         return *told, infos
+
+    def _require(self, actions: dict[str, Any]) -> None:
+        """Raises UserError unless there is an action for every agent and no other."""
+        if set(actions) != set(self.agents):
+            given = ", ".join(map(str, actions)) or "none"
+            raise UserError(f"actions: expected one for each of {', '.join(self.agents)}, got {given}")
 
     def render(self) -> UInt8[np.ndarray, "h w 3"] | None:
         return self._scenes.seen_by(self._view) if self._view else None

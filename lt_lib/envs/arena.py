@@ -4,6 +4,8 @@ Physics runs at 60 Hz and control at 10 Hz. An action is a body-frame velocity (
 to 0.5 m/s and 1.5 rad/s. The slab is solid, so a step in contact with it is a wasted step, not a shortcut.
 """
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -84,6 +86,24 @@ class Arena:
         self._ctrl[:, 1] = V_MAX * (sin * vx + cos * vy)
         self._ctrl[:, 2] = W_MAX * turn
         self._batch.step(None if live is None else np.flatnonzero(live), nstep=PHYSICS_HZ // CONTROL_HZ)
+        self._observe()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Every number that the next step depends on, to be given to `restore`, also in another process."""
+        parts = {"qpos": self._qpos, "qvel": self._qvel, "ctrl": self._ctrl, "mocap": self._mocap, "warm": self._warm}
+        return {name: np.array(values) for name, values in (parts | {"slab": self.slab, "scout": self.scout}).items()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Goes on from a `state` of an arena of the same layout and size.
+
+        Raises ValueError for a state of another shape or one that is not finite.
+        """
+        for name, values in self.state().items():
+            if state[name].shape != values.shape or not np.isfinite(state[name]).all():
+                raise ValueError(f"state: {name} must be finite, of shape {values.shape}, got {state[name].shape}")
+        self._qpos[:], self._qvel[:], self._ctrl[:] = state["qpos"], state["qvel"], state["ctrl"]
+        self._mocap[:], self._warm[:] = state["mocap"], state["warm"]
+        self.slab, self.scout = state["slab"].copy(), state["scout"].copy()
         self._observe()
 
     def _observe(self):

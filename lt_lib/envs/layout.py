@@ -5,7 +5,6 @@ from itertools import pairwise
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import yaml
 from pydantic import (
     AfterValidator,
     Field,
@@ -17,6 +16,7 @@ from pydantic import (
 )
 
 from lt_lib.settings.base import Settings, UserError, layout_path
+from lt_lib.settings.strict_yaml import read_yaml
 
 LEFT, RIGHT = 0, 1
 SIDES = ("left", "right")
@@ -240,10 +240,11 @@ def load_layout(name: str) -> Layout:
     in a wall, a missing or unknown key.
     """
     path = layout_path(name)
+    content = read_yaml(path)
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise UserError(f"layout {path.name}: not a YAML mapping of names to values")
     try:
-        return Layout(**yaml.safe_load(path.read_text()))
-    except (yaml.YAMLError, TypeError) as error:
-        raise UserError(f"layout {path.name}: not a YAML mapping ({str(error).splitlines()[0]})") from error
+        return Layout(**content)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))

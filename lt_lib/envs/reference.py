@@ -58,6 +58,7 @@ class TopView:
     """
 
     def __init__(self, layout: Layout, width: int = 480):
+        self._width = width
         (x0, x1), (y0, y1) = layout.arena.x, layout.arena.y
         margin = 2 * OUTER_THICKNESS
         height = int(width * (y1 - y0 + margin) / (x1 - x0 + margin)) // 2 * 2
@@ -69,6 +70,9 @@ class TopView:
         self._data = mujoco.MjData(self.model)
         self._renderer = open_renderer(self.model, height, width)
         self._options = _looking_at(SEEN, SCOUT, NAVIGATOR, FROM_ABOVE)
+
+    def __reduce__(self):
+        return TopView, (self._layout, self._width)  # a copy opens its own OpenGL
 
     def picture(self, navigator, slab: int, scout) -> UInt8[np.ndarray, "h w 3"]:
         """The scene with navigator (3,) and scout (2,) or (3,), metres and radians, and slab 0 left or 1 right."""

@@ -5,9 +5,10 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from lt_lib.report.registration import Registration, register
-from lt_lib.settings.base import ROOT, UserError, read_yaml
+from lt_lib.settings.base import ROOT, UserError
 from lt_lib.settings.hardware import HardwareGates
 from lt_lib.settings.profiles import explain
+from lt_lib.settings.strict_yaml import read_yaml
 
 GATES = ROOT / "params" / "gates" / "hardware.yaml"
 RECORD = "hardware_gates.json"

@@ -1,5 +1,6 @@
 """Estimates and verdicts of the point-mass study: the fitted curve, coverage, fair coins, edges (Fig. 3)."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from lt_lib.learnability.predictor import CONFIDENCE, CURVES, Curve, Curves
 from lt_lib.learnability.z_study import CEILING, CHANCE, Runs
 from lt_lib.report import judges, stats
 from lt_lib.report.stats import ALPHA
-from lt_lib.store.files import write_atomically
+from lt_lib.store.files import content_digest, write_atomically
 
 Success = Float[np.ndarray, "settings seeds"]
 Z = Float[np.ndarray, " settings"]
@@ -45,7 +46,9 @@ def centre_interval(curve: Curve) -> tuple[float, float]:
 
 def keep_curves(curves: Mapping[str, Curve], main: str, outputs: Path) -> None:
     """Writes the curves where the predictor looks for them, with the name of the one it answers from."""
-    write_atomically(outputs / CURVES, (Curves(main=main, curves=dict(curves)).model_dump_json() + "\n").encode())
+    content = Curves(main=main, curves=dict(curves)).model_dump(mode="json")
+    text = json.dumps({"sha256": content_digest(content), **content})
+    write_atomically(outputs / CURVES, (text + "\n").encode())
 
 
 def at_chance(success: Float[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:

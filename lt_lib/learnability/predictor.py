@@ -25,6 +25,7 @@ from lt_lib.envs.arena import CONTROL_HZ, V_MAX
 from lt_lib.envs.layout import Layout
 from lt_lib.settings.base import ROOT, Settings, UserError
 from lt_lib.settings.profiles import explain
+from lt_lib.store.files import content_digest
 
 CURVES = Path("curves") / "learnability.json"  # in a profile's outputs
 LEARNABLE, BORDERLINE, UNLEARNABLE = "learnable", "borderline", "unlearnable"
@@ -70,13 +71,16 @@ def load_curve(name: str = "", path: Path = ROOT / "outputs" / "full" / CURVES) 
     Raises a one-line UserError if it is missing or unreadable.
     """
     try:
-        kept = Curves.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        content = dict(json.loads(path.read_text(encoding="utf-8")))
+        if content.pop("sha256", None) != content_digest(content):
+            raise UserError(f"{path.name}: was altered (its checksum differs); run notebook 06 again")
+        kept = Curves.model_validate(content)
     except FileNotFoundError:
         where = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
         raise UserError(f"no curve at {where}; create it with `python run_all.py --only z_study`") from None
     except ValidationError as error:
         raise UserError(explain(error, path.name, Curves)) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise UserError(f"{path.name}: cannot be read: {error}") from None
     if (name or kept.main) not in kept.curves:
         raise UserError(f"{path.name}: no curve {name or kept.main!r}; known: {', '.join(kept.curves)}")

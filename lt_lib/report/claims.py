@@ -21,8 +21,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from lt_lib.report.firmness import firmness
 from lt_lib.report.inferred import calibrating_rows
-from lt_lib.settings.base import ROOT, Settings, UserError, read_yaml, require_known
+from lt_lib.settings.base import ROOT, Settings, UserError, require_known
 from lt_lib.settings.profiles import explain
+from lt_lib.settings.strict_yaml import read_yaml
 from lt_lib.store.files import content_digest, writable_folder, write_atomically
 
 Notebook = Literal[

@@ -13,9 +13,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from nbconvert import HTMLExporter
 from nbconvert.filters import markdown2html
+from nbformat import ValidationError
+from nbformat.reader import NotJSONError
 from traitlets.config import Config
 
 from lt_lib.report.scoreboard import MARKS
@@ -64,10 +67,17 @@ def write_report(outputs: Path) -> Path:
     notebooks = sorted((outputs / "notebooks").glob("*.ipynb"))
     exporter = _exporter()
     for path in notebooks:
-        page, _ = exporter.from_filename(str(path))
+        try:
+            page, _ = exporter.from_filename(str(path))
+        except (NotJSONError, ValidationError, ValueError, KeyError) as error:
+            raise UserError(f"{path} is no whole notebook ({type(error).__name__}); execute it again") from None
         write_atomically(folder / f"{path.stem}.html", page.encode())
     names = [path.stem for path in notebooks]
-    text = index(json.loads(manifest.read_text()), names, board.read_text(encoding="utf-8"), outputs / "figures")
+    try:
+        made = dict(json.loads(manifest.read_text(encoding="utf-8")))
+        text = index(made, names, board.read_text(encoding="utf-8"), outputs / "figures")
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise UserError(f"{manifest} is truncated or damaged; run_all.py writes it anew") from None
     write_atomically(folder / "index.html", text.encode())
     return folder / "index.html"
 
@@ -102,19 +112,22 @@ def _told(facts: Mapping[str, Any]) -> str:
 def _listing(entries: Mapping[str, Mapping[str, Any]], names: Sequence[str]) -> str:
     """Status and time of every notebook, each linked to its page if it has one."""
     rows = "".join(
-        f"<tr><td>{_linked(name, names)}</td><td>{entry['status']}</td><td>{entry['seconds']:,.0f} s</td></tr>"
+        f"<tr><td>{_linked(name, names)}</td><td>{html.escape(entry['status'])}</td>"
+        f"<td>{entry['seconds']:,.0f} s</td></tr>"
         for name, entry in sorted(entries.items())
     )
     return f"<table><tr><th>notebook</th><th>status</th><th>time</th></tr>{rows}</table>"
 
 
 def _linked(name: str, names: Sequence[str]) -> str:
-    return f'<a href="{name}.html">{name}</a>' if name in names else name
+    shown = html.escape(name)
+    return f'<a href="{quote(name)}.html">{shown}</a>' if name in names else shown
 
 
 def _scoreboard(board: str, names: Sequence[str]) -> str:
     """scoreboard.md as HTML, one heading level lower, with linked notebooks and coloured verdicts."""
-    page = markdown2html(re.sub(r"^#", "##", board, flags=re.MULTILINE))
+    escaped = html.escape(board, quote=False)  # notes may hold names of folders and parameters
+    page = markdown2html(re.sub(r"^#", "##", escaped, flags=re.MULTILINE))
     for name in names:
         page = re.sub(rf"(<h3[^>]*>){name}", rf"\1{_linked(name, names)}", page)
         page = page.replace(f'<a href="notebooks/{name}.ipynb">{name}</a>', _linked(name, names))
@@ -128,14 +141,17 @@ def _figure(path: Path, names: Sequence[str]) -> str:
     """A figure with its name, linked to the notebook that its number names."""
     source = f"data:{PICTURES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
     maker = next((name for name in names if name[:2] == path.stem[:2]), "09_scoreboard")
-    return f"""<figure><img src="{source}" alt="{path.stem}">
-<figcaption>{path.stem}, from {_linked(maker, names)}</figcaption></figure>
+    name = html.escape(path.stem)
+    return f"""<figure><img src="{source}" alt="{name}">
+<figcaption>{name}, from {_linked(maker, names)}</figcaption></figure>
 """
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command line and returns the exit status: 2 for a folder without outputs, otherwise 0."""
-    parser = argparse.ArgumentParser(prog="python -m lt_lib.report.html", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m lt_lib.report.html", description="Writes a profile's outputs as web pages."
+    )
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "full", metavar="DIR")
     try:
         print(write_report(parser.parse_args(arguments).outputs))

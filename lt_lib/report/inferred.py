@@ -8,8 +8,9 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from lt_lib.report.registration import Registration, register
-from lt_lib.settings.base import ROOT, Settings, UserError, read_yaml
+from lt_lib.settings.base import ROOT, Settings, UserError
 from lt_lib.settings.profiles import explain
+from lt_lib.settings.strict_yaml import read_yaml
 
 INFERRED = ROOT / "params" / "inferred.yaml"
 RECORD = "inferred.json"

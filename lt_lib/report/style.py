@@ -3,6 +3,7 @@
 from pathlib import Path
 from textwrap import fill
 
+import matplotlib
 from IPython.display import Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,6 +17,9 @@ ROLES = {
 }  # fmt: skip
 CHANCE = {"color": "black", "ls": ":", "lw": 1.2, "zorder": 0}
 DPI = 130
+
+# A user's matplotlibrc, with its fonts, boxes or LaTeX, would change every figure of a notebook that imports this
+matplotlib.rcdefaults()
 
 
 def chance_line(axes: Axes, level: float = 0.5) -> None:

@@ -5,7 +5,6 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, computed_field, model_validator
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -20,14 +19,6 @@ def require_known(names: Iterable[str], known: Collection[str], what: str, where
     for name in names:
         if name not in known:
             raise UserError(f"{where}unknown {what} {name!r}; known: {', '.join(known)}")
-
-
-def read_yaml(path: Path) -> Any:
-    """A YAML file's content. Raises a one-line UserError if it cannot be read."""
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise UserError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
 
 
 def _frozen(value: Any) -> Any:

@@ -2,12 +2,11 @@
 
 import ast
 import json
-from collections import Counter
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-import yaml
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
 from lt_lib.settings.base import ROOT, UserError, refuse_decided, require_known
@@ -16,7 +15,11 @@ from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, Ra
 from lt_lib.settings.learnability import Budget, PointMassConfig
 from lt_lib.settings.pixels import ExecutorConfig, PixelsConfig
 from lt_lib.settings.speed import Stretch
+from lt_lib.settings.strict_yaml import read_yaml
 from lt_lib.settings.velocity import Configuration, NavigatorConfig, PretrainingConfig, RolloutConfig
+
+# What run_all.py gives to every notebook; a profile may not
+GIVEN = ("profile", "outputs", "workers")
 
 
 def profile_names(root: Path = ROOT) -> list[str]:
@@ -25,8 +28,9 @@ def profile_names(root: Path = ROOT) -> list[str]:
 
 
 def notebook_names(root: Path = ROOT) -> list[str]:
-    """The notebooks of a project in numeric order, e.g. '04_pixels'."""
-    return sorted(path.stem for path in (root / "notebooks").glob("[0-9][0-9]_*.ipynb"))
+    """The notebooks of a project in numeric order, e.g. '04_pixels'; copies such as '04_pixels-Copy1' are none."""
+    stems = (path.stem for path in (root / "notebooks").glob("*.ipynb"))
+    return sorted(stem for stem in stems if re.fullmatch(r"\d\d_[a-z0-9_]+", stem))
 
 
 def notebook_defaults(path: Path) -> dict[str, Any]:
@@ -64,22 +68,9 @@ def load_profile(name: str, root: Path = ROOT) -> dict[str, dict[str, Any]]:
     return profile
 
 
-class _UniqueKeys(yaml.SafeLoader):
-    """YAML in which a key given twice is an error; by default the last one wins."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        for key, count in Counter(self.construct_object(key) for key, _ in node.value).items():
-            if count > 1:
-                raise yaml.MarkedYAMLError(problem=f"{key!r} is given twice", problem_mark=node.start_mark)
-        return super().construct_mapping(node, deep)
-
-
 def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dict[str, Any]]:
     """The sections of a profile's file. Raises UserError for an unknown notebook or shared parameter."""
-    try:
-        sections = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeys) or {}
-    except yaml.YAMLError as error:
-        raise UserError(f"{path.name}: not valid YAML: {' '.join(str(error).split())}") from None
+    sections = read_yaml(path) or {}
     if not isinstance(sections, dict):
         raise UserError(f"{path.name}: expected sections such as 'shared:', got {sections!r}")
     for section, values in sections.items():
@@ -87,6 +78,8 @@ def _read_sections(path: Path, defaults: Mapping[str, Mapping]) -> dict[str, dic
             require_known([section], defaults, "notebook", f"{path.name}: ")
         if not isinstance(values, dict):
             raise UserError(f"{path.name}: {section}: expected its parameters below it, got {values!r}")
+        for key in set(values) & set(GIVEN):
+            raise UserError(f"{path.name}: {section}: {key} comes from the command line (--{key}); leave it out")
     declared = {key for names in defaults.values() for key in names}
     for key in sections.get("shared", {}):
         if key not in declared:
@@ -157,7 +150,10 @@ SECTIONS: dict[str, Any] = {
     "executor": ExecutorConfig,
     "gridworld": GridworldConfig,
     "peek_seeds": dict[str, PositiveInt],
+    "poses": PositiveInt,
+    "pixels": PositiveInt,
     "ablation_seeds": PositiveInt,
+    "variant_seeds": PositiveInt,
     "forms": Annotated[list[Scaled], Field(min_length=2)],
     "form_seeds": PositiveInt,
     "point_mass": PointMassConfig,

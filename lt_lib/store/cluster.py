@@ -9,6 +9,7 @@ import hashlib
 import logging
 import os
 import re
+import socket
 import sys
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
@@ -16,6 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import dask
 import distributed
 import threadpoolctl
 
@@ -28,6 +30,7 @@ from lt_lib.store.run import Packed, Run, Submit, compute, library_versions
 OURS = "latent-telepathy-compendium"
 ADDRESS = re.compile(r"(tcp|tls)://(\[[0-9a-fA-F:.]+\]|[\w.-]+):\d{1,5}")
 ANSWER_S = 10  # seconds within which a scheduler must answer and have a worker
+TLS = "distributed.comm.tls"  # where Dask's configuration has the certificates
 TOPIC = "latent-telepathy-progress"
 
 
@@ -76,6 +79,7 @@ def connected(address: str) -> Iterator[distributed.Client]:
     Raises a one-line UserError for a bad address, no answer, no workers or an unfit worker.
     """
     require_address(address)
+    _require_scheduler(address)
     try:
         with _quiet():
             client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
@@ -84,6 +88,25 @@ def connected(address: str) -> Iterator[distributed.Client]:
     with client:
         _require_workers(client, address)
         yield client
+
+
+def _require_scheduler(address: str) -> None:
+    """Raises UserError unless something at the address greets as a Dask scheduler does; a client would wait forever."""
+    kind, _, place = address.partition("://")
+    host, _, port = place.rpartition(":")
+    missing = [name for name in ("ca-file", "client.cert", "client.key") if not dask.config.get(f"{TLS}.{name}", None)]
+    if kind == "tls" and missing:
+        names = ", ".join(f"DASK_{f'{TLS}.{name}'.upper().replace('.', '__').replace('-', '_')}" for name in missing)
+        raise UserError(f"{address}: TLS needs certificates; give their files in {names}")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S) as peer:
+            greeting = kind == "tls" or peer.recv(1)  # over TLS the client speaks first
+    except TimeoutError:
+        raise UserError(f"no Dask scheduler answers at {address} within {ANSWER_S} s; is that its port?") from None
+    except OSError as error:
+        raise UserError(f"no Dask scheduler answers at {address} ({error.strerror or error}); is it running?") from None
+    if not greeting:
+        raise UserError(f"what listens at {address} is no Dask scheduler; give the scheduler's own port")
 
 
 @contextlib.contextmanager

@@ -17,6 +17,10 @@ from lt_lib.settings.base import ROOT, UserError
 
 def writable_folder(folder: Path, instead: str = "") -> None:
     """Creates a folder if needed. Raises UserError if files cannot be written in it, saying what to do `instead`."""
+    if folder.is_symlink() and not folder.exists():
+        raise UserError(
+            f"{folder} is a link to {os.readlink(folder)}, which does not exist; create that, or remove the link"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -56,8 +60,8 @@ def claimed(folder: Path) -> Iterator[None]:
         ) from None
     except PermissionError:
         raise UserError(f"{folder} belongs to another user's run; name another with --outputs") from None
-    except OSError as error:
-        reason = f"its file system has no locks ({error.strerror})"
+    except (OSError, NotImplementedError) as error:  # filelock's own word for a file system without flock
+        reason = f"its file system has no locks ({getattr(error, 'strerror', None) or error})"
         logging.getLogger(__name__).warning("nothing keeps a second run_all.py out of %s: %s", folder, reason)
     try:
         write_atomically(owner, str(os.getpid()).encode())

@@ -9,9 +9,11 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+import joblib
 import psutil
 from joblib.externals.loky import get_reusable_executor
 
+from lt_lib.settings.base import UserError
 from lt_lib.store.progress import write_fraction
 from lt_lib.store.run import Submit, compute
 
@@ -28,6 +30,15 @@ ONE_THREAD = dict.fromkeys(
 )
 
 
+def cores() -> int:
+    """The cores that this process may use. Raises a one-line UserError for an unusable LOKY_MAX_CPU_COUNT."""
+    try:
+        return joblib.cpu_count()
+    except ValueError:
+        given = os.environ.get("LOKY_MAX_CPU_COUNT")
+        raise UserError(f"LOKY_MAX_CPU_COUNT: expected a whole number of cores, at least 1, got {given!r}") from None
+
+
 @contextlib.contextmanager
 def local_workers(processes: int, source: str, progress: Path) -> Iterator[Submit]:
     """Worker processes of one thread each, which end with this process, however it ends, and if the block fails.
@@ -35,9 +46,12 @@ def local_workers(processes: int, source: str, progress: Path) -> Iterator[Submi
     They are kept for the next stage, since each takes seconds to start, unless they were started from another `source`:
     workers must run the source that was digested.
     """
-    pool = get_reusable_executor(
-        processes, timeout=IDLE_S, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(), source)
-    )
+    try:
+        pool = get_reusable_executor(
+            processes, timeout=IDLE_S, env=ONE_THREAD, initializer=_end_with, initargs=(os.getpid(), source)
+        )
+    except OSError as error:  # semaphores live there on Linux
+        raise UserError(f"cannot start worker processes ({error.strerror}); they need a writable /dev/shm") from None
     try:
         with warnings.catch_warnings():  # loky warns whenever it replaces a worker that has grown or idled
             warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)

@@ -13,13 +13,15 @@ from typing import Any
 
 import psutil
 
+from lt_lib.store.computer import processor
 from lt_lib.store.files import write_atomically
+from lt_lib.store.journal import lines_since
 
 
 def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str, Mapping[str, Any]]) -> None:
     """Writes the manifest; earlier entries of notebooks that did not run this time are kept.
 
-    notebooks: {name: {"status": text, "seconds": float, "stages": as from `stages_since`}} of this time.
+    notebooks: {name: {"status": text, "seconds": float, and as from `computed_since`}} of this time.
     """
     earlier = _notebooks_in(path)
     commit = git_state(root)
@@ -44,16 +46,21 @@ def _notebooks_in(path: Path) -> dict[str, Any]:
         return {}
 
 
-def stages_since(journal: Path, position: int) -> dict[str, dict[str, int | float]]:
-    """Runs computed since the journal was `position` bytes long: {function: {"runs": count, "seconds": total}}."""
+def computed_since(store: Path, position: int, asked_by: str) -> dict[str, Any]:
+    """What someone had computed since the store's journal was `position` bytes long.
+
+    "stages"     {function: {"runs": count, "seconds": total}}
+    "computers"  that made the results which were used, newly computed or kept
+    """
     stages: dict[str, dict[str, int | float]] = {}
-    if journal.exists():
-        for line in journal.read_bytes()[position:].splitlines():
-            entry = json.loads(line)
-            stage = stages.setdefault(entry["function"], {"runs": 0, "seconds": 0.0})
+    computers: set[str] = set()
+    for line in lines_since(store, position, asked_by):
+        computers |= set(line.get("computers", ()))
+        if "function" in line:
+            stage = stages.setdefault(line["function"], {"runs": 0, "seconds": 0.0})
             stage["runs"] += 1
-            stage["seconds"] = round(stage["seconds"] + entry["seconds"], 1)
-    return stages
+            stage["seconds"] = round(stage["seconds"] + line["seconds"], 1)
+    return {"stages": stages, "computers": sorted(computers)}
 
 
 def versions(requirements: Path) -> dict[str, str]:
@@ -63,26 +70,38 @@ def versions(requirements: Path) -> dict[str, str]:
 
 
 def git_state(root: Path) -> dict[str, Any]:
-    """The commit checked out and whether anything but outputs differs from it; None and None outside git."""
+    """The commit checked out and whether anything but outputs differs from it.
+
+    Both are None, with the reason in "no_commit", where `root` is not the top of a git checkout of our own: in an
+    unpacked archive, even inside another repository, and in a checkout that git does not trust.
+    """
+    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # a hook names its own
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=own).stdout.strip()
 
     try:
+        top = Path(git("rev-parse", "--show-toplevel"))
+        if top.resolve() != root.resolve():
+            return _no_commit(f"no git checkout of its own: it lies in that of {top.name}")
         changed = git("status", "--porcelain", "--", ".", ":!outputs")
         return {"commit": git("rev-parse", "HEAD"), "uncommitted_changes": bool(changed)}
-    except (OSError, subprocess.CalledProcessError):
-        return {"commit": None, "uncommitted_changes": None}
+    except subprocess.CalledProcessError as error:
+        return _no_commit((error.stderr.strip().splitlines() or ["git fails"])[0])
+    except OSError as error:
+        return _no_commit(f"git does not start ({error.strerror})")
+
+
+def _no_commit(reason: str) -> dict[str, Any]:
+    return {"commit": None, "uncommitted_changes": None, "no_commit": reason}
 
 
 def machine() -> dict[str, Any]:
     """System, CPU, usable cores, and memory in GiB."""
-    info = Path("/proc/cpuinfo")
-    models = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", flags=re.MULTILINE)
     return {
         "system": f"{platform.system()} {platform.machine()}",
-        "cpu": models[0] if models else platform.processor(),
+        "cpu": processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
     }

@@ -21,12 +21,13 @@ import numpy as np
 import safetensors.numpy
 
 from lt_lib.settings.base import Settings
+from lt_lib.store.computer import computer
 from lt_lib.store.progress import Reporter
 from lt_lib.store.sources import source_digest
 
 Result = dict[str, Any]
 
-Packed = tuple[bytes, float]  # a packed result and the seconds it took
+Packed = tuple[bytes, float, str]  # a packed result, the seconds it took, and the computer
 Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run, given its key
 
 # What a result may depend on besides our own code.
@@ -70,7 +71,7 @@ def compute(run: Run, tell: Callable[[float], None]) -> Packed:
     """Computes one run in a worker, which reports its progress."""
     started = time.perf_counter()
     payload = pack(run.function(run.config, run.seed, report=Reporter(tell), **run.inputs))
-    return payload, time.perf_counter() - started
+    return payload, time.perf_counter() - started, computer()
 
 
 def pack(result: Result) -> bytes:

@@ -1,7 +1,6 @@
 """The run store: every training is computed once, locally or on a cluster, and stored in one checked file."""
 
 import hashlib
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, as_completed
@@ -10,10 +9,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-import joblib
-
+from lt_lib.store import journal
 from lt_lib.store.files import writable_folder, write_atomically
-from lt_lib.store.local import local_workers
+from lt_lib.store.local import cores, local_workers
 from lt_lib.store.progress import stage
 from lt_lib.store.run import Packed, Result, Run, Submit, unpack
 from lt_lib.store.sources import source_state
@@ -45,26 +43,28 @@ class RunStore:
         writable_folder(self.folder)
         keys = [run.key() for run in runs]
         wanted = dict(zip(keys, runs, strict=True))
-        results = {key: self._read(key, run) for key, run in wanted.items()}
-        missing = {key: run for key, run in wanted.items() if results[key] is None}
+        kept = {key: self._read(key, run) for key, run in wanted.items()}
+        missing = {key: run for key, run in wanted.items() if kept[key] is None}
         if missing:
             self._compute(missing, what)
-            results |= {key: self._read(key, run) for key, run in missing.items()}
-        return [results[key] for key in keys]
+            kept |= {key: self._read(key, run) for key, run in missing.items()}
+        journal.append(self.folder, {"fetched": what, "computers": sorted({made_on for _, made_on in kept.values()})})
+        return [kept[key][0] for key in keys]
 
     def _path(self, key: str, run: Run) -> Path:
         return self.folder / run.function.__name__ / f"{key}.run"
 
-    def _read(self, key: str, run: Run) -> Result | None:
-        """A finished run's result; None if its file is missing or, with a warning, damaged."""
+    def _read(self, key: str, run: Run) -> tuple[Result, str] | None:
+        """A finished run's result and the computer that made it; None if its file is missing or, warned of, damaged."""
         path = self._path(key, run)
         if not path.exists():
             return None
         head, _, payload = path.read_bytes().partition(b"\n")
-        if head != _checksum(payload):
+        made_on = head.decode(errors="replace").split(" ", 2)[-1]
+        if head != _head(payload, made_on):
             logging.getLogger(__name__).warning("%s is truncated or altered; recomputing %s", path, run)
             return None
-        return unpack(payload)
+        return unpack(payload), made_on
 
     def _compute(self, missing: Mapping[str, Run], what: str) -> None:
         """Has workers compute runs and stores each as soon as it is done."""
@@ -91,7 +91,7 @@ class RunStore:
 
             return cluster_workers(self.workers, progress)
         source = "".join(sorted({source_state(function) for function in {run.function for run in missing.values()}}))
-        return local_workers(min(self.workers or joblib.cpu_count(), len(missing)), source, progress)
+        return local_workers(min(self.workers or cores(), len(missing)), source, progress)
 
     def _end(self, key: str, run: Run, future: "Future[Packed]") -> BaseException | None:
         """Stores the result of a run that ended; returns the error if it has none or cannot be stored."""
@@ -105,9 +105,9 @@ class RunStore:
             return error
         return None
 
-    def _keep(self, key: str, run: Run, payload: bytes, seconds: float) -> None:
+    def _keep(self, key: str, run: Run, payload: bytes, seconds: float, made_on: str) -> None:
         """Writes a run's file, then its line in the journal."""
-        write_atomically(self._path(key, run), _checksum(payload) + b"\n" + payload)
+        write_atomically(self._path(key, run), _head(payload, made_on) + b"\n" + payload)
         line = {
             "key": key,
             "function": run.function.__name__,
@@ -116,8 +116,12 @@ class RunStore:
             "seconds": round(seconds, 3),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        with (self.folder / "journal.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line) + "\n")
+        journal.append(self.folder, line)
+
+
+def _head(payload: bytes, made_on: str) -> bytes:
+    """The first line of a run's file: its checksum, which covers the computer too."""
+    return _checksum(payload + made_on.encode()) + b" " + made_on.encode()
 
 
 def _checksum(payload: bytes) -> bytes:
