@@ -1,10 +1,13 @@
 """A real Dask scheduler with worker processes on loopback: the same bytes, and what may go wrong with it."""
 
+import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -12,6 +15,7 @@ from pathlib import Path
 import distributed
 import numpy as np
 import pytest
+from dask import config as dask_config
 from toy_project import LIMIT_S, journal, kept_files, losses, wait_until
 from toy_runs import ToyConfig, count_threads, train_toy
 
@@ -207,3 +211,65 @@ def test_a_lost_scheduler_is_named_and_finished_runs_are_kept(small_cluster, tmp
     with pytest.raises(RunError, match=f"3 of 4 runs failed.*lost the scheduler at {small_cluster.address}"):
         future.result(timeout=LIMIT_S)
     assert len(kept_files(tmp_path)) == 1
+
+
+# --- what listens at the address, and TLS
+
+
+@pytest.mark.parametrize("greets", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_what_is_no_scheduler_is_told_within_seconds(project, capfd, monkeypatch, greets):
+    """A web server waits for a request; another says something of its own, which no Dask client understands."""
+    monkeypatch.setattr(cluster, "ANSWER_S", 2)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            while True:
+                try:
+                    peer, _ = server.accept()
+                except OSError:
+                    return
+                peers.append(peer)
+                if greets:
+                    peer.sendall(greets)
+
+        peers: list[socket.socket] = []
+        threading.Thread(target=serve, daemon=True).start()
+        started = time.monotonic()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        assert_refused(project, capfd, address, f"no Dask scheduler answers at {address}")
+        assert time.monotonic() - started < 20
+
+
+def test_tls_without_certificates_says_where_to_name_them(project, capfd):
+    assert_refused(
+        project, capfd, "tls://127.0.0.1:8786", "TLS needs certificates", "DASK_DISTRIBUTED__COMM__TLS__CA_FILE"
+    )
+
+
+@pytest.mark.skipif(not shutil.which("openssl"), reason="needs openssl to make certificates")
+def test_runs_go_over_tls_as_the_readme_says(tmp_path, monkeypatch):
+    own = ["-subj", "/CN=localhost", "-keyout", "key.pem", "-out", "cert.pem", "-days", "2", "-nodes"]
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", *own], cwd=tmp_path, check=True, capture_output=True
+    )
+    cert, key, file = (str(tmp_path / name) for name in ("cert.pem", "key.pem", "scheduler.json"))
+    secured = ["--tls-ca-file", cert, "--tls-cert", cert, "--tls-key", key]
+    place = ["--protocol", "tls", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", file]
+    processes = [dask("scheduler", *place, *secured)]
+    try:
+        wait_until(Path(file).exists, LIMIT_S)
+        address = json.loads(Path(file).read_text())["address"]
+        assert address.startswith("tls://")
+        processes.append(dask("worker", address, "--nthreads", "1", "--no-nanny", *secured))
+        names = {f"{cluster.TLS}.ca-file": cert, f"{cluster.TLS}.client.cert": cert, f"{cluster.TLS}.client.key": key}
+        with dask_config.set(names):  # as the environment's DASK_DISTRIBUTED__... would
+            (result,) = RunStore(tmp_path / "runs", address).fetch(toys(1), "toys")
+        np.testing.assert_array_equal(result["weights"], np.random.default_rng(0).normal(size=(4, 3)))
+        plain = f"tcp://{address.partition('://')[2]}"
+        monkeypatch.setattr(cluster, "ANSWER_S", 3)
+        with pytest.raises(UserError, match="no Dask scheduler"):
+            RunStore(tmp_path / "others", plain).fetch(toys(1), "toys")
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()

@@ -1,11 +1,16 @@
 """The task as other people's learners meet it: their libraries' own checkers, and the arena stepped directly."""
 
+import copy
+import pickle
+from typing import ClassVar
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from pettingzoo.test import parallel_api_test, parallel_seed_test
+from pettingzoo.utils import aec_to_parallel, parallel_to_aec, wrappers
 
 from lt_lib.comm.messages import CONTENT
 from lt_lib.environments import gym
@@ -13,6 +18,7 @@ from lt_lib.environments.gym import ArenaEnv, ArenaVectorEnv
 from lt_lib.environments.team import NAVIGATOR, SCOUT, TeamEnv
 from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena
 from lt_lib.envs.camera import FastCamera, colours
+from lt_lib.envs.geodesic import RouteDistance
 from lt_lib.envs.layout import load_layout
 from lt_lib.pixels import episodes
 from lt_lib.settings.base import UserError
@@ -219,3 +225,159 @@ def test_out_of_range_nothing_arrives(layout):
     env._scenes.arena.scout[:, 0] = 100.0
     observed, *_ = env.step({NAVIGATOR: np.zeros(3, np.float32), SCOUT: np.ones(CONTENT, np.float32)})
     assert not observed[NAVIGATOR]["wire"].any()
+
+
+# --- what learners do with environments
+
+
+@pytest.mark.parametrize("make", [ArenaEnv, lambda: ArenaVectorEnv(3)])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_bit_for_bit_and_leaves_the_original_alone(make, copied):
+    env, rng = make(), np.random.default_rng(0)
+    env.reset(seed=1)
+    actions = rng.uniform(-1, 1, (30, *env.action_space.shape)).astype(np.float32)
+    for action in actions[:15]:
+        env.step(action)
+    twin, third = copied(env), copied(env)
+    for action in actions[15:]:
+        for mine, its in zip(env.step(action), twin.step(action), strict=True):
+            np.testing.assert_equal(mine, its)
+    assert (env._scenes.arena.pose == twin._scenes.arena.pose).all()
+    assert (third._scenes.arena.pose != env._scenes.arena.pose).any()
+    np.testing.assert_equal(env.reset()[0], twin.reset()[0])  # the next draw of the scene, too
+
+
+def test_a_copied_team_delivers_what_was_in_flight():
+    env = TeamEnv(content=4, latency=3)
+    env.reset(seed=0)
+    said = {SCOUT: np.arange(4, dtype=np.float32), NAVIGATOR: np.zeros(3, np.float32)}
+    env.step(said)
+    twin = pickle.loads(pickle.dumps(env))
+    quiet = said | {SCOUT: np.zeros(4, np.float32)}
+    for _ in range(2):
+        mine, its = env.step(quiet)[0][NAVIGATOR]["wire"], twin.step(quiet)[0][NAVIGATOR]["wire"]
+        np.testing.assert_array_equal(mine, its)
+    np.testing.assert_array_equal(mine[2:], said[SCOUT])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_action_or_message_that_is_not_finite_is_refused_with_its_environment(bad, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    many = ArenaVectorEnv(3)
+    many.reset(seed=0)
+    actions = np.zeros((3, 3))
+    actions[1, 2] = bad
+    with pytest.raises(UserError, match=r"action of environment 1: .* finite numbers, got \[0.0, 0.0, (nan|inf)\]"):
+        many.step(actions)
+    team = TeamEnv()
+    team.reset(seed=0)
+    still, said = np.zeros(3), np.zeros(CONTENT)
+    with pytest.raises(UserError, match="^message: expected finite numbers"):
+        team.step({NAVIGATOR: still, SCOUT: np.full(CONTENT, bad)})
+    with pytest.raises(UserError, match="^action: expected finite numbers"):
+        team.step({NAVIGATOR: np.full(3, bad), SCOUT: said})
+    arena = many._scenes.arena
+    with pytest.raises(ValueError, match=r"state: qpos must be finite, of shape \(3, 3\)"):
+        arena.restore(arena.state() | {"qpos": np.full((3, 3), bad)})
+    assert not list(tmp_path.iterdir())  # MuJoCo logs into the current folder when its numbers blow up
+
+
+@pytest.mark.parametrize("action, shape", [(np.zeros(2), r"\(2,\)"), (np.zeros((1, 3)), r"\(1, 3\)"), (0.5, r"\(\)")])
+def test_an_action_of_another_shape_is_refused_with_the_shape_wanted(action, shape):
+    env = ArenaEnv()
+    env.reset(seed=0)
+    with pytest.raises(UserError, match=rf"action: expected shape \(3,\), got {shape}"):
+        env.step(action)
+    with pytest.raises(UserError, match="action: expected numbers of shape"):
+        env.step({"vx": 1})
+
+
+def test_the_team_names_the_agents_whose_actions_it_misses():
+    env = TeamEnv()
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="actions: expected one for each of navigator, scout, got navigator"):
+        env.step({NAVIGATOR: np.zeros(3)})
+    with pytest.raises(UserError, match="got none"):
+        env.step({})
+
+
+def test_a_vector_run_keeps_gymnasium_s_promises_at_an_episode_s_end(monkeypatch):
+    """Next-step reset: the last observation is the episode's own, and the next step ignores its action."""
+    monkeypatch.setattr(gym, "HORIZON", 5)
+    env = gymnasium.make_vec(ID, num_envs=3)
+    env.reset(seed=0)
+    assert env.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    alone = ArenaEnv()
+    alone.reset(seed=1)  # row 1's own
+    ahead = np.tile(np.array([1.0, 0.2, 0.1], np.float32), (3, 1))
+    for _ in range(5):
+        frames, _, _, truncated, _ = env.step(ahead)
+        last = alone.step(ahead[0])
+    assert truncated.all() and last[3]
+    np.testing.assert_array_equal(frames[1], last[0])
+    frames, rewards, terminated, truncated, _ = env.step(ahead)
+    fresh, _ = alone.reset()
+    np.testing.assert_array_equal(frames[1], fresh)
+    assert not rewards.any() and not terminated.any() and not truncated.any()
+
+
+class Shaped(gymnasium.Wrapper):
+    """The navigator's environment with the walking distance gained as reward, so that there is something to learn."""
+
+    def __init__(self, env: gymnasium.Env):
+        super().__init__(env)
+        self._distance = RouteDistance(env.unwrapped._scenes.arena.layout)
+
+    def _to_go(self) -> float:
+        place = self.unwrapped._scenes.arena.pose[:, :2]
+        return min(float(self._distance(place, np.array([side]))[0]) for side in (0, 1))
+
+    def reset(self, **options):
+        out = self.env.reset(**options)
+        self._before = self._to_go()
+        return out
+
+    def step(self, action):
+        frame, reward, *rest = self.env.step(action)
+        before, self._before = self._before, self._to_go()
+        return frame, reward + before - self._before, *rest
+
+
+@pytest.mark.slow
+def test_stable_baselines_ppo_learns_to_drive_forward():
+    baselines = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.env_util import make_vec_env
+
+    class Rewards(BaseCallback):
+        means: ClassVar[list[float]] = []
+
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_end(self) -> None:
+            self.means.append(float(self.model.rollout_buffer.rewards.mean()))
+
+    env = make_vec_env(lambda: gymnasium.wrappers.TimeLimit(Shaped(ArenaEnv()), 64), n_envs=8, seed=0)
+    model = baselines.PPO("CnnPolicy", env, n_steps=64, batch_size=128, n_epochs=4, seed=0)
+    model.learn(4096, callback=Rewards())
+    assert np.mean(Rewards.means[-2:]) > np.mean(Rewards.means[:2]) + 0.01  # metres per step
+
+
+@pytest.mark.slow
+def test_a_learner_trains_on_the_team_through_pettingzoo_s_wrappers():
+    """REINFORCE on the scout: its message learns the number that the navigator's wire is rewarded for."""
+    env = aec_to_parallel(wrappers.OrderEnforcingWrapper(parallel_to_aec(TeamEnv(content=1))))
+    rng, mean, rewards = np.random.default_rng(0), np.zeros(1), []
+    for episode in range(120):
+        env.reset(seed=episode)
+        said = (mean + rng.normal(size=1)).astype(np.float32)
+        for _ in range(2):
+            told, *_ = env.step({NAVIGATOR: np.zeros(3, np.float32), SCOUT: said})
+        heard = told[NAVIGATOR]["wire"][2]
+        assert heard == said[0]
+        reward = -((heard - 2.0) ** 2)
+        baseline = np.mean(rewards[-20:]) if rewards else reward
+        mean = mean + 0.03 * np.clip(reward - baseline, -3, 3) * (said - mean)
+        rewards.append(reward)
+    assert np.mean(rewards[-30:]) > np.mean(rewards[:30]) + 1

@@ -39,16 +39,19 @@ def velocity_space() -> Box:
 
 
 def finite(what: str, values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Values as floats. Raises UserError unless they are finite and have the shape, whose first axis counts rows."""
+    """Values as floats. Raises UserError unless they are finite and of the shape; of two axes, the first is rows."""
     try:
         array = np.asarray(values, np.float64)
     except (TypeError, ValueError):
         raise UserError(f"{what}: expected numbers of shape {shape}, got {type(values).__name__}") from None
     if array.shape != shape:
         raise UserError(f"{what}: expected shape {shape}, got {array.shape}")
-    wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
-    if len(wrong):
-        raise UserError(f"{what} of environment {wrong[0]}: expected finite numbers, got {array[wrong[0]].tolist()}")
+    if len(shape) == 1:
+        if not np.isfinite(array).all():
+            raise UserError(f"{what}: expected finite numbers, got {array.tolist()}")
+        return array
+    for row in np.flatnonzero(~np.isfinite(array).all(axis=1)):
+        raise UserError(f"{what} of environment {row}: expected finite numbers, got {array[row].tolist()}")
     return array
 
 
@@ -113,11 +116,6 @@ class Scenes:
         return view.picture(self.arena.pose[0], int(self.arena.slab[0]), self.arena.scout[0])
 
 
-def _one(action: Any) -> Any:
-    """The action of a single environment as a batch of one."""
-    return np.asarray(action)[None]
-
-
 class ArenaEnv(gymnasium.Env):
     """One navigator without messages. Ends on arrival; truncated after 600 steps.
 
@@ -138,8 +136,9 @@ class ArenaEnv(gymnasium.Env):
         self._scenes.restart(np.ones(1, bool), [self.np_random])
         return self._scenes.navigator_frames()[0], self._scenes.info()
 
-    def step(self, action: Float[np.ndarray, "3"]):
-        reward, terminated, truncated = self._scenes.step(_one(action))
+    def step(self, action: Any):
+        """One control step under an action (3,). Raises UserError for another shape and for one that is not finite."""
+        reward, terminated, truncated = self._scenes.step(finite("action", action, self.action_space.shape)[None])
         frame = self._scenes.navigator_frames()[0]
         return frame, reward.item(), terminated.item(), truncated.item(), self._scenes.info()
 
@@ -172,7 +171,8 @@ class ArenaVectorEnv(VectorEnv):
         self._scenes.restart(np.ones(self.num_envs, bool), self._rngs)
         return self._scenes.navigator_frames(), self._infos()
 
-    def step(self, actions: Float[np.ndarray, "n 3"]):
+    def step(self, actions: Any):
+        """One control step under actions (n, 3). Raises UserError for another shape and for one that is not finite."""
         fresh = self._ended
         reward, terminated, truncated = self._scenes.step(actions)
         if fresh.any():

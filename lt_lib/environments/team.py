@@ -75,10 +75,11 @@ class TeamEnv(ParallelEnv):
         if not self.agents:
             return {}, {}, {}, {}, {}
         self._require(actions)
-        (content,) = self.action_spaces[SCOUT].shape
-        arena, message = self._scenes.arena, finite("message", np.asarray(actions[SCOUT])[None], (1, content))
-        self._in_flight.send(self._age, torch.from_numpy(message).float(), arena.scout[:, :2])
-        reward, terminated, truncated = self._scenes.step(np.asarray(actions[NAVIGATOR])[None])
+        message = finite("message", actions[SCOUT], self.action_spaces[SCOUT].shape)
+        command = finite("action", actions[NAVIGATOR], self.action_spaces[NAVIGATOR].shape)
+        arena = self._scenes.arena
+        self._in_flight.send(self._age, torch.from_numpy(message).float()[None], arena.scout[:, :2])
+        reward, terminated, truncated = self._scenes.step(command[None])
         self._age += 1
         self._wire = self._in_flight.receive(self._age, arena.pose[:, :2])[0].numpy()
         told = self._observe(), *map(self._each, (reward.item(), terminated.item(), truncated.item()))

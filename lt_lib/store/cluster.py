@@ -30,6 +30,7 @@ from lt_lib.store.run import Packed, Run, Submit, compute, library_versions
 OURS = "latent-telepathy-compendium"
 ADDRESS = re.compile(r"(tcp|tls)://(\[[0-9a-fA-F:.]+\]|[\w.-]+):\d{1,5}")
 ANSWER_S = 10  # seconds within which a scheduler must answer and have a worker
+LONGEST_HANDSHAKE = 2**20  # bytes
 TLS = "distributed.comm.tls"  # where Dask's configuration has the certificates
 TOPIC = "latent-telepathy-progress"
 
@@ -100,13 +101,14 @@ def _require_scheduler(address: str) -> None:
         raise UserError(f"{address}: TLS needs certificates; give their files in {names}")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S) as peer:
-            greeting = kind == "tls" or peer.recv(1)  # over TLS the client speaks first
+            greeting = peer.recv(8, socket.MSG_WAITALL) if kind == "tcp" else b""  # over TLS the client speaks first
     except TimeoutError:
         raise UserError(f"no Dask scheduler answers at {address} within {ANSWER_S} s; is that its port?") from None
     except OSError as error:
         raise UserError(f"no Dask scheduler answers at {address} ({error.strerror or error}); is it running?") from None
-    if not greeting:
-        raise UserError(f"what listens at {address} is no Dask scheduler; give the scheduler's own port")
+    # a scheduler begins with the length of its handshake, and a client would allocate whatever else stands there
+    if kind == "tcp" and not 0 < int.from_bytes(greeting, "little") < LONGEST_HANDSHAKE:
+        raise UserError(f"no Dask scheduler answers at {address}, but something else; give the scheduler's own port")
 
 
 @contextlib.contextmanager

@@ -202,22 +202,27 @@ class DirectTransfer:
 
         layout  another scene than the study's
         """
-        shared = {"episodes": episodes} | ({"layout": layout} if layout else {})
-        chosen = [self._roll(self._silent(rows=(SAMPLED,), **shared), r, seed) for seed, r in enumerate(trained)]
-        incumbents = [commitment(result)[0] for result in self.store.fetch(chosen, "incumbent corridors")]
-        runs = [
-            self._roll(self._silent(rows=tuple(rows), blocked=SIDES[1 - incumbent], **shared), r, seed)
-            for seed, (incumbent, r) in enumerate(zip(incumbents, trained, strict=True))
-        ]
-        return list(map(Swept, incumbents, self.store.fetch(runs, "coverage sweep")))
+        return self._swept(list(enumerate(trained)), tuple(rows), episodes, layout)
 
     def at_looks(self, trained: Sequence[Result]) -> dict[int, list[Swept]]:
         """Table II after every look of the pretraining, with fewer episodes per row; one navigator per seed."""
-        episodes = self.pretraining.episodes
-        return {
-            look: self.swept([after(each, look) for each in trained], tuple(TABLE_2.values()), episodes)
-            for look in self.pretraining.looks
-        }
+        looks, seeds = self.pretraining.looks, list(enumerate(trained))
+        kept = [(seed, after(each, look)) for look in looks for seed, each in seeds]
+        found = self._swept(kept, tuple(TABLE_2.values()), self.pretraining.episodes)
+        return {look: found[i * len(seeds) : (i + 1) * len(seeds)] for i, look in enumerate(looks)}
+
+    def _swept(
+        self, navigators: Sequence[tuple[int, Result]], rows: tuple[Exploration, ...], episodes: int, layout: str = ""
+    ) -> list[Swept]:
+        """As `swept`, for navigators with their seeds."""
+        shared = {"episodes": episodes} | ({"layout": layout} if layout else {})
+        chosen = [self._roll(self._silent(rows=(SAMPLED,), **shared), r, seed) for seed, r in navigators]
+        incumbents = [commitment(result)[0] for result in self.store.fetch(chosen, "incumbent corridors")]
+        runs = [
+            self._roll(self._silent(rows=rows, blocked=SIDES[1 - incumbent], **shared), r, seed)
+            for incumbent, (seed, r) in zip(incumbents, navigators, strict=True)
+        ]
+        return list(map(Swept, incumbents, self.store.fetch(runs, "coverage sweep")))
 
     def slippery(self) -> dict[float, list[Swept]]:
         """Table II with other frictions of walls and slab, in training and in the sweep; one navigator per seed."""
