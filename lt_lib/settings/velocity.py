@@ -41,7 +41,7 @@ class NavigatorConfig(Training):
     starts: Literal["anywhere", "beyond"] = "beyond"  # the curriculum's: the free arena, or only past the mouths
     spawn_share: Share = 0.5  # of episodes that start at the spawn regardless of the curriculum
     boost: Boost = Boost()
-    steps: PositiveInt = 262_144  # 32 updates
+    steps: PositiveInt = 229_376  # 28 updates
     looks: tuple[PositiveInt, ...] = ()  # control steps after which the weights are kept too, whole updates each
     envs: PositiveInt = 128
     rollout: PositiveInt = 64  # control steps per environment and update
