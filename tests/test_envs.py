@@ -247,6 +247,12 @@ def test_a_copy_goes_on_bit_for_bit_and_leaves_the_original_alone(make, copied):
     np.testing.assert_equal(env.reset()[0], twin.reset()[0])  # the next draw of the scene, too
 
 
+def test_a_copy_draws_its_own_pictures():
+    env = ArenaEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    np.testing.assert_array_equal(copy.deepcopy(env).render(), env.render())
+
+
 def test_a_copied_team_delivers_what_was_in_flight():
     env = TeamEnv(content=4, latency=3)
     env.reset(seed=0)
