@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
         ("02_encoder: {count: '2'}", "smoke.yaml: 02_encoder: count: expected int such as 2, got '2'"),
         ("02_encoder: {count: true}", "smoke.yaml: 02_encoder: count: expected int such as 2, got True"),
         ("02_encoder: {count: 2.0}", "smoke.yaml: 02_encoder: count: expected int such as 2, got 2.0"),
-        ("shared: {share: 3e-4}", "smoke.yaml: 02_encoder: share: expected float such as 0.5, got '3e-4'"),
+        ("shared: {share: 1:30}", "smoke.yaml: 02_encoder: share: expected float such as 0.5, got '1:30'"),
         ("02_encoder: {content: 3}", "smoke.yaml: 02_encoder: content: expected str such as 'latent', got 3"),
         (
             "02_encoder: {sizes: [1, a]}",
@@ -51,8 +51,8 @@ pytestmark = pytest.mark.slow
         ),
         ("02_encoder: 3", "smoke.yaml: 02_encoder: expected its parameters "),
         ("- 3", "smoke.yaml: expected sections such as 'shared:', got [3]"),
-        ("02_encoder: {toy: [", "smoke.yaml: not valid YAML: "),
-        ("02_encoder: {}\n02_encoder: {count: 3}", "smoke.yaml: not valid YAML: '02_encoder' is given twice"),
+        ("02_encoder: {toy: [", "smoke.yaml: line 1: not valid YAML: "),
+        ("02_encoder: {}\n02_encoder: {count: 3}", "smoke.yaml: line 2: not valid YAML: '02_encoder' is given twice"),
     ],
 )
 def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml, complaint):
