@@ -211,7 +211,7 @@ def test_paper_meets_every_criterion_of_its_own():
         (GOOD.replace("0.05", "[0.05, 0.1]"), "a: expected one margin for each of 0.9"),
         (GOOD.replace("measured", "config"), "a: kind config allows at most one of"),
         ("a: 1\n", "expected a list of entries"),
-        ("- [\n", "cannot be read"),
+        ("- [\n", "not valid YAML"),
         (None, "cannot be read"),
     ],
 )

@@ -221,8 +221,8 @@ def test_curves_are_read_from_what_the_study_kept(tmp_path):
     assert predictor.load_curve(path=path) == other and predictor.load_curve("100 updates", path) == CURVE
     with pytest.raises(UserError, match="no curve '7 updates'; known: 100 updates, 200 updates"):
         predictor.load_curve("7 updates", path)
-    path.write_text(path.read_text().replace('"width":0.3', '"width":-0.3'))
-    with pytest.raises(UserError, match="width: must be greater than 0"):
+    path.write_text(path.read_text().replace('"width": 0.3', '"width": 0.4'))
+    with pytest.raises(UserError, match="learnability.json: was altered"):
         predictor.load_curve(path=path)
 
 
