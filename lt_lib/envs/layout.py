@@ -240,7 +240,10 @@ def load_layout(name: str) -> Layout:
     in a wall, a missing or unknown key.
     """
     path = layout_path(name)
-    content = read_yaml(path)
+    try:
+        content = read_yaml(path)
+    except UserError as error:
+        raise UserError(f"layout {error}") from None
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise UserError(f"layout {path.name}: not a YAML mapping of names to values")
     try:
