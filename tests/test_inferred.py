@@ -10,7 +10,7 @@ from scipy.stats import t as student
 from lt_lib.gridworld.views import rescaled
 from lt_lib.learnability.score_function import train_point_mass
 from lt_lib.report import stats
-from lt_lib.report.claims import CALIBRATED, Finding, load_claims, verdict
+from lt_lib.report.claims import CALIBRATED, NOT_REPRODUCED, Finding, load_claims, verdict
 from lt_lib.report.inferred import RECORD, Choice, calibrating_rows, load_inferred, registered
 from lt_lib.report.registration import register
 from lt_lib.report.scoreboard import independent, join
@@ -87,6 +87,11 @@ def test_a_calibrating_row_counts_for_nothing_whatever_it_says(row):
         assert verdict(claim, finding, "full") == CALIBRATED
         assert row not in set(independent(join({row: claim}, {row: finding}, "full")).id)
     assert verdict(claim, finding, "quick") != CALIBRATED
+
+
+def test_words_that_no_value_of_a_setting_makes_true_are_not_reproduced():
+    claim = load_claims()["grid.zero_value"]
+    assert claim.calibrates and verdict(claim, Finding(value="no", holds=False), "full") == NOT_REPRODUCED
 
 
 def test_a_changed_file_is_told_and_a_broken_one_refused(tmp_path):

@@ -170,7 +170,8 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
     not run         there is no finding
     '' (none)       the profile is not the full one, so the run is too small to tell
     needs a robot   a hardware claim without real frames; with real frames it counts as measured
-    calibrated      a setting that the paper does not print was inferred from this row, so it counts for nothing
+    calibrated      a setting that the paper does not print was inferred from this row, so it counts for nothing; but words
+                    that no value of the setting makes true are not reproduced
     gate            a threshold that stops the run where it is missed, so the row cannot fail
     context         geometry or settings that the paper does not print, or a finding that it does not have
     reproduced      the claim's criterion (below) is met, and its own test, which could have failed, holds
@@ -187,7 +188,7 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
         return NOT_RUN
     if profile != JUDGED:
         return NO_VERDICT
-    if claim.calibrates:
+    if claim.calibrates and (numbers(claim.paper) or finding.value == claim.paper):
         return CALIBRATED
     if claim.kind == "hardware" and not finding.real_frames:
         return NEEDS_A_ROBOT
