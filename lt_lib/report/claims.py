@@ -170,8 +170,8 @@ def verdict(claim: Claim, finding: Finding | None, profile: str) -> str:
     not run         there is no finding
     '' (none)       the profile is not the full one, so the run is too small to tell
     needs a robot   a hardware claim without real frames; with real frames it counts as measured
-    calibrated      a setting that the paper does not print was inferred from this row, so it counts for nothing; but words
-                    that no value of the setting makes true are not reproduced
+    calibrated      a setting that the paper does not print was inferred from this row, so it counts for nothing; but
+                    words that no value of the setting makes true are not reproduced
     gate            a threshold that stops the run where it is missed, so the row cannot fail
     context         geometry or settings that the paper does not print, or a finding that it does not have
     reproduced      the claim's criterion (below) is met, and its own test, which could have failed, holds
