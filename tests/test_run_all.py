@@ -51,7 +51,7 @@ pytestmark = pytest.mark.slow
         ),
         ("02_encoder: 3", "smoke.yaml: 02_encoder: expected its parameters "),
         ("- 3", "smoke.yaml: expected sections such as 'shared:', got [3]"),
-        ("02_encoder: {toy: [", "smoke.yaml: line 1: not valid YAML: "),
+        ("02_encoder: {toy: [", "smoke.yaml: line 2: not valid YAML: "),
         ("02_encoder: {}\n02_encoder: {count: 3}", "smoke.yaml: line 2: not valid YAML: '02_encoder' is given twice"),
     ],
 )

@@ -1,8 +1,8 @@
 """The device that a training computes on, and the precision of its frozen encoder."""
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import torch
 from pydantic import BeforeValidator
 
 from lt_lib.settings.base import UserError
@@ -10,6 +10,8 @@ from lt_lib.settings.base import UserError
 
 def computing_device(name: Literal["auto", "cpu", "cuda"]) -> Literal["cpu", "cuda"]:
     """The device meant on this machine: 'auto' is cuda if available. Raises UserError for a missing one."""
+    import torch  # here, since it takes seconds to import, which bad settings need not wait for
+
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise UserError("device: cuda: torch finds no CUDA device here, only the CPU; expected cpu or auto")
@@ -19,11 +21,12 @@ def computing_device(name: Literal["auto", "cpu", "cuda"]) -> Literal["cpu", "cu
 def computing_precision(name: Any) -> Any:
     """The precision meant on this machine: 'auto' is bfloat16 where the CPU multiplies matrices of it, else float32.
 
-    On other CPUs bfloat16 is emulated, at half the speed of float32.
+    On other CPUs bfloat16 is emulated, at half the speed of float32. Linux alone says what the CPU can do.
     """
     if name != "auto":
         return name
-    return "bfloat16" if torch.cpu._is_amx_tile_supported() else "float32"
+    info = Path("/proc/cpuinfo")
+    return "bfloat16" if info.exists() and "amx_bf16" in info.read_text() else "float32"
 
 
 # resolved when settings are read, so that a run's key names the precision that computed it

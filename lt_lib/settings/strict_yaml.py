@@ -19,7 +19,7 @@ SCALARS = {  # tag: what matches it, and the characters that it may start with
 }
 
 
-class _Strict(yaml.SafeLoader):
+class _Strict(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # the compiled parser, where it was built
     yaml_implicit_resolvers = {}  # noqa: RUF012 (PyYAML's own way to replace the inherited ones)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
