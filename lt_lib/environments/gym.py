@@ -46,12 +46,11 @@ def finite(what: str, values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, 
         raise UserError(f"{what}: expected numbers of shape {shape}, got {type(values).__name__}") from None
     if array.shape != shape:
         raise UserError(f"{what}: expected shape {shape}, got {array.shape}")
-    if len(shape) == 1:
-        if not np.isfinite(array).all():
-            raise UserError(f"{what}: expected finite numbers, got {array.tolist()}")
-        return array
-    for row in np.flatnonzero(~np.isfinite(array).all(axis=1)):
-        raise UserError(f"{what} of environment {row}: expected finite numbers, got {array[row].tolist()}")
+    if not np.isfinite(array).all():
+        if len(shape) > 1:
+            row = int(np.argmin(np.isfinite(array).all(axis=1)))
+            what, array = f"{what} of environment {row}", array[row]
+        raise UserError(f"{what}: expected finite numbers, got {array.tolist()}")
     return array
 
 
@@ -76,11 +75,8 @@ class Scenes:
         self.entered[which], self._age[which] = NO_CORRIDOR, 0
 
     def step(self, action: np.ndarray):
-        """One control step; action (n, 3). Returns reward, terminated (arrived) and truncated (time-out), each (n,).
-
-        Raises UserError, with the environment's index, for an action of another shape or one that is not finite.
-        """
-        self.arena.step(finite("action", action, (self.arena.n, *velocity_space().shape)))
+        """One control step; action (n, 3). Returns reward, terminated (arrived) and truncated (time-out), each (n,)."""
+        self.arena.step(action)
         self._age += 1
         self.entered = np.where(self.entered == NO_CORRIDOR, self.arena.corridor, self.entered)
         reached = self.arena.reached
@@ -174,7 +170,7 @@ class ArenaVectorEnv(VectorEnv):
     def step(self, actions: Any):
         """One control step under actions (n, 3). Raises UserError for another shape and for one that is not finite."""
         fresh = self._ended
-        reward, terminated, truncated = self._scenes.step(actions)
+        reward, terminated, truncated = self._scenes.step(finite("action", actions, self.action_space.shape))
         if fresh.any():
             self._scenes.restart(fresh, self._rngs)
             reward, terminated, truncated = reward * ~fresh, terminated & ~fresh, truncated & ~fresh

@@ -23,7 +23,7 @@ from lt_lib.settings.gridworld import (
 from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
-from lt_lib.store.runs import RunStore
+from lt_lib.store.runs import RunStore, fetch_by_name
 from lt_lib.store.states import only
 
 SEED = 0  # of the one encoder; receivers have seeds of their own
@@ -95,8 +95,7 @@ class GridProtocol:
             for name, change in changes.items()
             for seed in range(seeds)
         }
-        results = dict(zip(runs, self.store.fetch(list(runs.values()), "gridworld variants"), strict=True))
-        return {name: [results[name, seed] for seed in range(seeds)] for name in changes}
+        return fetch_by_name(self.store.fetch, runs, "gridworld variants")
 
     def _fetch(self, wanted: Mapping[str, tuple[str, int, Result]]) -> dict[str, list[Result]]:
         runs = {
@@ -104,8 +103,7 @@ class GridProtocol:
             for name, (content, count, encoder) in wanted.items()
             for seed in range(count)
         }
-        results = dict(zip(runs, self.store.fetch(list(runs.values()), "gridworld policies"), strict=True))
-        return {name: [results[name, seed] for seed in range(count)] for name, (_, count, _) in wanted.items()}
+        return fetch_by_name(self.store.fetch, runs, "gridworld policies")
 
     def corrupted(
         self, policies: Mapping[str, list[Result]], episodes: int, encoder: Result

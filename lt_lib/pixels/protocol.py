@@ -26,7 +26,7 @@ from lt_lib.settings.pixels import EvaluationConfig, HeadConfig, PixelsConfig, R
 from lt_lib.settings.profiles import validated
 from lt_lib.store.files import runs_folder
 from lt_lib.store.run import Result, Run
-from lt_lib.store.runs import RunStore
+from lt_lib.store.runs import RunStore, fetch_by_name
 from lt_lib.store.states import only
 
 SEED = 0  # of the one encoder and the one executor, as in the paper; heads have seeds of their own
@@ -123,7 +123,7 @@ class PixelProtocol:
             if name not in REDRAWS
             for seed in range(count)
         }
-        return self._by_name(runs, "route heads")
+        return fetch_by_name(self.store.fetch, runs, "route heads")
 
     def with_minibatch(self, minibatch: int) -> "PixelProtocol":
         """The same protocol with another minibatch of the route head, episodes."""
@@ -155,14 +155,7 @@ class PixelProtocol:
             ("float32", SEED): once.model_copy(update={"precision": "float32", "episodes": 2 * once.batch}),
         }
         runs = {key: Run(train_redrawn_head, config, key[1], inputs) for key, config in configs.items()}
-        return self._by_name(runs, "redrawn heads")
-
-    def _by_name(self, runs: Mapping[tuple[str, int], Run], what: str) -> dict[str, list[Result]]:
-        """The results of runs named (row, seed): a list of seeds per row."""
-        results: dict[str, list[Result]] = {}
-        for (name, _), result in zip(runs, self.store.fetch(list(runs.values()), what), strict=True):
-            results.setdefault(name, []).append(result)
-        return results
+        return fetch_by_name(self.store.fetch, runs, "redrawn heads")
 
     def corrupted(
         self, name: str, seed: int, head: Result, episodes: int, bank: Result, encoder: Result

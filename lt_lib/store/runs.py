@@ -2,7 +2,7 @@
 
 import hashlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -117,6 +117,16 @@ class RunStore:
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         }
         journal.append(self.folder, line)
+
+
+def fetch_by_name(
+    fetch: Callable[[list[Run], str], list[Result]], runs: Mapping[tuple[str, int], Run], what: str
+) -> dict[str, list[Result]]:
+    """What a store's `fetch` returns for runs that are called (name, seed): a list of seeds per name."""
+    results: dict[str, list[Result]] = {}
+    for (name, _), result in zip(runs, fetch(list(runs.values()), what), strict=True):
+        results.setdefault(name, []).append(result)
+    return results
 
 
 def _head(payload: bytes, made_on: str) -> bytes:

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import numpy as np
+from jaxtyping import Bool, Float
+
 from lt_lib.envs.layout import SIDES
 from lt_lib.pixels.protocol import PixelProtocol
 from lt_lib.settings.base import UserError, everywhere
@@ -15,7 +18,7 @@ from lt_lib.settings.ppo import PpoConfig
 from lt_lib.settings.profiles import validated
 from lt_lib.settings.velocity import Boost, Exploration, NavigatorConfig, PretrainingConfig, RolloutConfig
 from lt_lib.store.run import Result, Run
-from lt_lib.store.runs import RunStore
+from lt_lib.store.runs import RunStore, fetch_by_name
 from lt_lib.store.states import after, only
 from lt_lib.velocity.coverage import TABLE_2, roll_navigator
 from lt_lib.velocity.judgements import commitment
@@ -81,6 +84,16 @@ class Swept(NamedTuple):
     @property
     def alternative(self) -> int:
         return 1 - self.incumbent
+
+    @property
+    def covered(self) -> Bool[np.ndarray, "rows episodes"]:
+        """Whether each episode entered the alternative corridor."""
+        return self.rows["entered"][..., self.alternative]
+
+    @property
+    def shares(self) -> Float[np.ndarray, "rows 2"]:
+        """Coverage and success of every row."""
+        return np.stack([self.covered.mean(axis=1), self.rows["success"].mean(axis=1)], axis=1)
 
 
 class Bit(NamedTuple):
@@ -216,8 +229,7 @@ class DirectTransfer:
     ) -> list[Swept]:
         """As `swept`, for navigators with their seeds."""
         shared = {"episodes": episodes} | ({"layout": layout} if layout else {})
-        chosen = [self._roll(self._silent(rows=(SAMPLED,), **shared), r, seed) for seed, r in navigators]
-        incumbents = [commitment(result)[0] for result in self.store.fetch(chosen, "incumbent corridors")]
+        incumbents = self._incumbents(self._silent(rows=(SAMPLED,), **shared), navigators)
         runs = [
             self._roll(self._silent(rows=rows, blocked=SIDES[1 - incumbent], **shared), r, seed)
             for incumbent, (seed, r) in zip(incumbents, navigators, strict=True)
@@ -247,7 +259,7 @@ class DirectTransfer:
             for name, boost in BOOSTS.items()
             for seed, start in enumerate(starts if name == "annealed" else starts[:1])
         }
-        return self._by_name(runs, "boosted trainings")
+        return fetch_by_name(self.store.fetch, runs, "boosted trainings")
 
     @property
     def _boosted_steps(self) -> int:
@@ -259,13 +271,17 @@ class DirectTransfer:
         Without noise. All navigators get the same draws of the scene.
         """
         shared = {"content": "oracle", "episodes": episodes}
-        spawn = [self._roll(self._configured(rows=(GREEDY,), **shared), r, seed) for seed, r in enumerate(trained)]
-        incumbents = [commitment(result)[0] for result in self.store.fetch(spawn, "incumbent corridors")]
+        incumbents = self._incumbents(self._configured(rows=(GREEDY,), **shared), list(enumerate(trained)))
         cases = [(side, true) for side in SIDES for true in (True, False)]
         configs = [self._configured(rows=(GREEDY,), blocked=side, truthful=true, **shared) for side, true in cases]
         runs = [self._roll(config, r) for r in trained for config in configs]
         results = iter(self.store.fetch(runs, "flipped bits"))
         return [Bit(incumbent, {case: next(results) for case in cases}) for incumbent in incumbents]
+
+    def _incumbents(self, config: RolloutConfig, navigators: Sequence[tuple[int, Result]]) -> list[int]:
+        """The corridor that each frozen navigator, given with its seed, enters first in most episodes of a rollout."""
+        runs = [self._roll(config, navigator, seed) for seed, navigator in navigators]
+        return [commitment(result)[0] for result in self.store.fetch(runs, "incumbent corridors")]
 
     def _trained(
         self, changes: Mapping[str, Mapping[str, Any]], seeds: Mapping[str, int], what: str
@@ -275,13 +291,7 @@ class DirectTransfer:
             for name, change in changes.items()
             for seed in range(seeds[name])
         }
-        return self._by_name(runs, what)
-
-    def _by_name(self, runs: Mapping[tuple[str, int], Run], what: str) -> dict[str, list[Result]]:
-        results: dict[str, list[Result]] = {}
-        for (name, _), result in zip(runs, self.store.fetch(list(runs.values()), what), strict=True):
-            results.setdefault(name, []).append(result)
-        return results
+        return fetch_by_name(self.store.fetch, runs, what)
 
     def _stopped(self, trained: Result) -> Result:
         steps = self.navigator.steps
