@@ -19,14 +19,15 @@ def computing_device(name: Literal["auto", "cpu", "cuda"]) -> Literal["cpu", "cu
 
 
 def computing_precision(name: Any) -> Any:
-    """The precision meant on this machine: 'auto' is bfloat16 where the CPU multiplies matrices of it, else float32.
+    """The precision meant on this machine: 'auto' is bfloat16 where the CPU multiplies numbers of it, else float32.
 
     On other CPUs bfloat16 is emulated, at half the speed of float32. Linux alone says what the CPU can do.
     """
     if name != "auto":
         return name
     info = Path("/proc/cpuinfo")
-    return "bfloat16" if info.exists() and "amx_bf16" in info.read_text() else "float32"
+    flags = info.read_text() if info.exists() else ""
+    return "bfloat16" if "amx_bf16" in flags or "avx512_bf16" in flags else "float32"
 
 
 # resolved when settings are read, so that a run's key names the precision that computed it
