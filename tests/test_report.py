@@ -102,14 +102,15 @@ def test_rank_test_with_ties_equals_a_literal_loop(greater, less):
 
 def test_rank_test_without_ties_equals_scipy():
     rng = np.random.default_rng(0)
-    greater, less = rng.normal(0.5, 1, 6), rng.normal(0, 1, 5)
-    expected = scipy_stats.mannwhitneyu(greater, less, alternative="greater", method="exact").pvalue
-    assert stats.rank_test(greater, less) == pytest.approx(expected, abs=EXACT)
+    for sizes in ((6, 5), (25, 30)):
+        greater, less = rng.normal(0.5, 1, sizes[0]), rng.normal(0, 1, sizes[1])
+        expected = scipy_stats.mannwhitneyu(greater, less, alternative="greater", method="exact").pvalue
+        assert stats.rank_test(greater, less) == pytest.approx(expected, abs=EXACT)
 
 
-@pytest.mark.parametrize("greater, less", [([], [0.5]), ([0.5], []), (np.ones(20), np.ones(20))])
-def test_rank_test_refuses_what_it_cannot_enumerate(greater, less):
-    with pytest.raises(ValueError, match="cannot enumerate"):
+@pytest.mark.parametrize("greater, less", [([], [0.5]), ([0.5], [])])
+def test_rank_test_refuses_an_empty_sample(greater, less):
+    with pytest.raises(ValueError, match="two samples"):
         stats.rank_test(greater, less)
 
 
