@@ -211,6 +211,7 @@ def test_paper_meets_every_criterion_of_its_own():
         (GOOD.replace("refuted: r, ", ""), "a: a measured claim says what would refute it"),
         (GOOD.replace("0.05", "[0.05, 0.1]"), "a: expected one margin for each of 0.9"),
         (GOOD.replace("measured", "config"), "a: kind config allows at most one of"),
+        (GOOD.replace("margin: 0.05", "margin: 0.05, calibrates: a.b"), "a: calibrates: stands in inferred.yaml alone"),
         ("a: 1\n", "expected a list of entries"),
         ("- [\n", "not valid YAML"),
         (None, "cannot be read"),

@@ -17,13 +17,12 @@ from typing import Annotated, Any, Literal
 from zlib import crc32
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
+from lt_lib.report.entries import parsed, read_entries
 from lt_lib.report.firmness import firmness
-from lt_lib.report.inferred import calibrating_rows
+from lt_lib.report.inferred import INFERRED, calibrating_rows
 from lt_lib.settings.base import ROOT, Settings, UserError, require_known
-from lt_lib.settings.profiles import explain
-from lt_lib.settings.strict_yaml import read_yaml
 from lt_lib.store.files import content_digest, writable_folder, write_atomically
 
 Notebook = Literal[
@@ -136,24 +135,11 @@ def load_claims(path: Path = CLAIMS) -> dict[str, Claim]:
     Raises a one-line UserError with the id for an unreadable file, an unknown key or notebook, a missing or malformed
     value, a duplicate id, and a criterion that does not suit the kind.
     """
-    entries, rows = read_yaml(path), calibrating_rows()
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise UserError(f"{path.name}: expected a list of entries '- {{id: ..., nb: ..., ...}}'")
-    claims: dict[str, Claim] = {}
-    for entry in entries:
-        claim = _parse(Claim, entry, f"{path.name}: {entry.get('id')}")
-        if claim.id in claims:
-            raise UserError(f"{path.name}: {claim.id} appears twice")
-        claims[claim.id] = claim
+    claims, rows = read_entries(path, Claim, "id"), calibrating_rows()
+    for claim in claims.values():
+        if claim.calibrates:
+            raise UserError(f"{path.name}: {claim.id}: calibrates: stands in {INFERRED.name} alone; leave it out here")
     return {name: claim.model_copy(update={"calibrates": rows.get(name, "")}) for name, claim in claims.items()}
-
-
-def _parse(model: type[Settings], entry: Mapping[str, Any], where: str) -> Any:
-    """Parses an entry into a model; pydantic's complaint becomes a one-line UserError."""
-    try:
-        return model.model_validate(dict(entry))
-    except ValidationError as error:
-        raise UserError(explain(error, where, model)) from None
 
 
 def numbers(value: Value) -> tuple[Number, ...] | None:
@@ -269,7 +255,7 @@ class Findings:
         for key, item in entry.items():
             if not all(math.isfinite(x) for x in np.ravel(item) if isinstance(x, float)):
                 raise UserError(f"{where}: {key} must be finite, got {item}")
-        finding = _parse(Finding, entry, where)
+        finding = parsed(Finding, entry, where)
         _check_shape(self.claims[name], finding, where)
         self.found[name] = finding
 

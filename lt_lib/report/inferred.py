@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
+from lt_lib.report.entries import read_entries
 from lt_lib.report.registration import Registration, register
-from lt_lib.settings.base import ROOT, Settings, UserError
-from lt_lib.settings.profiles import explain
-from lt_lib.settings.strict_yaml import read_yaml
+from lt_lib.settings.base import ROOT, Settings
 
 INFERRED = ROOT / "params" / "inferred.yaml"
 RECORD = "inferred.json"
@@ -63,19 +62,7 @@ class Choice(NamedTuple):
 
 def load_inferred(path: Path = INFERRED) -> dict[str, Inferred]:
     """Every inferred setting by where its value stands. Raises a one-line UserError for an unreadable file or entry."""
-    entries = read_yaml(path)
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise UserError(f"{path.name}: expected a list of entries '- {{setting: ..., what: ..., ...}}'")
-    settings: dict[str, Inferred] = {}
-    for entry in entries:
-        try:
-            setting = Inferred.model_validate(entry)
-        except ValidationError as error:
-            raise UserError(explain(error, f"{path.name}: {entry.get('setting')}", Inferred)) from None
-        if setting.setting in settings:
-            raise UserError(f"{path.name}: {setting.setting} appears twice")
-        settings[setting.setting] = setting
-    return settings
+    return read_entries(path, Inferred, "setting")
 
 
 def calibrating_rows(path: Path = INFERRED) -> dict[str, str]:
