@@ -12,7 +12,7 @@ from lt_lib.envs.layout import Layout
 from lt_lib.settings.base import UserError
 from lt_lib.store.files import content_digest, write_atomically
 
-FORMAT = 1
+FORMAT = 2  # since the scene has friction
 
 
 def save_frozen(folder: Path, kind: str, arrays: Mapping[str, np.ndarray], layout: Layout, facts: Mapping) -> Path:
@@ -50,7 +50,7 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
     payload = path.read_bytes()
     try:
         sidecar = json.loads(sidecar_path.read_text(encoding="utf-8"))
-        expected = sidecar.pop("sidecar_sha256", None)  # older sidecars have none
+        expected = sidecar.pop("sidecar_sha256")
         found = (sidecar["kind"], sidecar["format"], sidecar["sha256"], sidecar["layout"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
@@ -60,7 +60,7 @@ def load_frozen(folder: Path, kind: str, layout: Layout) -> dict[str, np.ndarray
         raise UserError(
             f"weights: {path} holds kind {found[0]}, format {found[1]}; expected kind {kind}, format {FORMAT}"
         )
-    if expected not in (None, content_digest(sidecar)):
+    if expected != content_digest(sidecar):
         raise UserError(f"weights: {sidecar_path} was altered (its checksum differs); freeze the weights again")
     if hashlib.sha256(payload).hexdigest() != found[2]:
         raise UserError(
