@@ -137,7 +137,7 @@ def flip(path, place):
         (lambda f: flip(f / "encoder.safetensors", 100), "is truncated or altered"),
         (lambda f: flip(f / "encoder.json", (f / "encoder.json").read_bytes().index(b"0.97") + 3), "was altered"),
         (lambda f: edit(f / "encoder.json", kind="executor"), "holds kind executor, format 2; expected kind encoder"),
-        (lambda f: edit(f / "encoder.json", format=9), "format 9; expected kind encoder, format 1"),
+        (lambda f: edit(f / "encoder.json", format=9), "format 9; expected kind encoder, format 2"),
         (
             lambda f: edit(f / "encoder.json", layout=load_layout("leaking").model_dump(mode="json")),
             "was trained in a scene other than layout 'default'",
