@@ -11,9 +11,9 @@ torch.set_num_threads(1)  # as in a run's worker; two would fight over the cores
 import lt_lib.envs.raycast  # compiled code, imported before the checks so that they leave it alone
 import lt_lib.gridworld.table_ppo
 import lt_lib.gridworld.walks
-import lt_lib.hardware.recolour
 import lt_lib.learnability.windows
 import lt_lib.perception.first_layer
+import lt_lib.perception.recolour
 import lt_lib.perception.renewal  # noqa: F401
 
 jaxtyping.install_import_hook("lt_lib", "beartype.beartype")

@@ -12,17 +12,18 @@ from lt_lib.envs.camera import colours
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.materials import HAZARD, INDEX, PALETTE
 from lt_lib.hardware import capture, optics
-from lt_lib.hardware.matched import PictureEncoder, colour_codes, select, train_matched_encoder
+from lt_lib.hardware.matched import select, train_matched_encoder
 from lt_lib.hardware.placements import draw_placements, simulated_frames
 from lt_lib.hardware.probe import decoded, fit_probe, frechet, placements_right, red_shares, transfer
 from lt_lib.hardware.protocol import FILMED, HardwareProtocol, past_the_rails
-from lt_lib.hardware.randomise import NOT_RED, TEXTURED, draw_appearances, recoloured
 from lt_lib.hardware.real_frames import read_sessions
 from lt_lib.hardware.registration import GATES, RECORD, read_gates, registered_gates
 from lt_lib.hardware.sessions import EFFECTS, Session, film_session, film_sweep, simulated_session, with_effect
 from lt_lib.hardware.surrogate import SurrogateScene
+from lt_lib.perception.appearance import NOT_RED, TEXTURED, draw_appearances, recoloured
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import random_rollouts
+from lt_lib.perception.pictures import PictureEncoder, colour_codes
 from lt_lib.pixels.executor import Executor
 from lt_lib.preflight import check_inputs
 from lt_lib.settings.base import UserError

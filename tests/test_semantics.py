@@ -18,12 +18,12 @@ from lt_lib.gridworld.episodes import greedy, play
 from lt_lib.gridworld.map import Grid
 from lt_lib.gridworld.mappo import Actor, Inputs
 from lt_lib.gridworld.walks import first_states
-from lt_lib.hardware.matched import PictureEncoder
 from lt_lib.hardware.probe import CameraTransfer, Probe, fit_probe, transfer
 from lt_lib.hardware.sessions import Session
 from lt_lib.perception import gates, jepa, objective
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.perception.frames import Rollouts, random_rollouts
+from lt_lib.perception.pictures import PictureEncoder
 from lt_lib.pixels import redraw
 from lt_lib.pixels.episodes import Outcomes, draw_scenes
 from lt_lib.pixels.executor import Driving

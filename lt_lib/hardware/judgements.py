@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import mannwhitneyu
 
-from lt_lib.hardware.matched import PictureEncoder
 from lt_lib.hardware.probe import CameraTransfer, decoded, fit_probe, red_shares
 from lt_lib.hardware.sessions import Session
+from lt_lib.perception.pictures import PictureEncoder
 from lt_lib.report import judges, stats
 from lt_lib.report.stats import ALPHA
 from lt_lib.store.run import Result

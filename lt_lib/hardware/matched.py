@@ -7,82 +7,25 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int, UInt8
 from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.metrics import balanced_accuracy_score
-from torch import Tensor
 
 from lt_lib.envs.layout import load_layout
 from lt_lib.envs.materials import INDEX
-from lt_lib.hardware.randomise import SURFACES, Appearances, draw_appearances, eight_bits, recoloured
-from lt_lib.perception.encoder import LATENT, Encoder, Frozen, in_chunks
-from lt_lib.perception.frames import Rollouts, hazard_visible, random_rollouts, wall_pixels
+from lt_lib.perception.appearance import SURFACES, draw_appearances, eight_bits, recoloured
+from lt_lib.perception.encoder import LATENT
+from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixels
 from lt_lib.perception.gates import PROBE_SHARE, effective_rank
-from lt_lib.perception.jepa import COLOUR_LEVELS, GRID
-from lt_lib.perception.objective import Jepa, Losses, class_weights, fit, frozen
+from lt_lib.perception.pictures import PictureEncoder, draw_pictures, fit_pictures
 from lt_lib.settings.base import UserError
 from lt_lib.settings.hardware import HardwareGates, MatchedEncoderConfig, MatchedGateConfig
 from lt_lib.settings.streams import Stream
 
-SAMPLE = 2_048  # frames that the class weights and the normalisation are taken from
-
-
-class PictureEncoder(Frozen):
-    """For RGB pictures (B, 64, 64, 3), from the flat mapping that `train_matched_encoder` returns."""
-
-    def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu"):
-        super().__init__(Encoder(), weights, device, "float32")
-
-    def inputs(self, observations: UInt8[np.ndarray, "b 64 64 3"]) -> Float[Tensor, "b 64 64 3"]:
-        return torch.from_numpy(observations.astype(np.float32) / 255).to(self.device)
-
-    def latents(self, pictures: UInt8[np.ndarray, "n 64 64 3"]) -> Float[np.ndarray, "n 64"]:
-        """Normalised latents of any number of pictures."""
-        return in_chunks(self.latent, pictures)
-
-
-def colour_codes(colours: Float[np.ndarray, "b h w 3"]) -> Int[np.ndarray, "b g g"]:
-    """The class of each cell: the colour at its centre, quantised to COLOUR_LEVELS a channel."""
-    step = colours.shape[1] // GRID
-    cells = colours[:, step // 2 :: step, step // 2 :: step]
-    quantised = np.minimum((cells * COLOUR_LEVELS).astype(np.int64), COLOUR_LEVELS - 1)
-    return quantised @ np.array([COLOUR_LEVELS**2, COLOUR_LEVELS, 1])
-
 
 def train_matched_encoder(config: MatchedEncoderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
-    """Trains E and P on random rollouts in random appearances; returns what `jepa.train_encoder` does.
-
-    "E.*", "P.*"  weights;  "mean", "std" (64,) of the latent over training frames
-    "loss.*"      (updates,) each term before weighting
-    """
+    """`perception.pictures.fit_pictures` on random rollouts in random appearances."""
     rng = Stream.MATCHED_ENCODER.generator(seed)
-    layout = load_layout(config.layout)
-    rollouts = random_rollouts(layout, config.frames // config.rollout, config.rollout, rng)
-    looks = draw_appearances(len(rollouts.frames), layout.camera.pixels, config.colour, config.texture, rng)
-    sample = _sample(rollouts, looks, rng)
-    device = config.device
-    with torch.random.fork_rng(devices=[]):  # module initialisation draws from torch's global generator
-        torch.manual_seed(seed)
-        model = Jepa(Encoder(), class_weights(colour_codes(sample), COLOUR_LEVELS**3), GRID).to(device)
-    frames, actions = rollouts.frames, torch.from_numpy(rollouts.actions)
-
-    def losses(r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Losses:
-        now, following = (recoloured(frames[r, t + k], looks.of(r)) for k in (0, 1))
-        codes = torch.from_numpy(colour_codes(now)).to(device)
-        goal = model.goal(torch.from_numpy(following).to(device))
-        latent = model.encoder(torch.from_numpy(now).to(device))
-        return model.losses(latent, actions[r, t].to(device), goal, codes)
-
-    curves = fit(model, losses, frames.shape[:2], config, rng, report)
-    with torch.no_grad():
-        latents = model.encoder(torch.from_numpy(sample).to(device)).cpu().numpy()
-    return frozen(model, latents) | curves
-
-
-def _sample(rollouts: Rollouts, looks: Appearances, rng: np.random.Generator) -> Float[np.ndarray, "n h w 3"]:
-    r, t = (rng.integers(0, n, SAMPLE) for n in rollouts.frames.shape[:2])
-    return recoloured(rollouts.frames[r, t], looks.of(r))
+    return fit_pictures(draw_pictures(config, rng), config, seed, rng, report)
 
 
 class Shown(NamedTuple):

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, UInt8
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import balanced_accuracy_score, roc_auc_score
 
-from lt_lib.hardware.matched import PictureEncoder
 from lt_lib.hardware.sessions import Session
+from lt_lib.perception.pictures import PictureEncoder
 
 
 class Probe(NamedTuple):

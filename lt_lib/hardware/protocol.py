@@ -9,13 +9,14 @@ import torch
 from jaxtyping import Float
 
 from lt_lib.envs.layout import load_layout
-from lt_lib.hardware.matched import PictureEncoder, measure_matched_gates, train_matched_encoder
+from lt_lib.hardware.matched import measure_matched_gates, train_matched_encoder
 from lt_lib.hardware.probe import CameraTransfer, transfer
 from lt_lib.hardware.real_frames import read_sessions
 from lt_lib.hardware.sessions import Session, film_session, film_sweep, session_of, simulated_session
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.gates import encode
+from lt_lib.perception.pictures import PictureEncoder
 from lt_lib.pixels.episodes import obedience, roll_bank
 from lt_lib.pixels.executor import ROUTES, FrozenExecutor, train_executor
 from lt_lib.settings.base import ROOT, UserError, everywhere

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from lt_lib.envs.layout import load_layout
 from lt_lib.hardware import optics
 from lt_lib.hardware.placements import Placements, draw_placements, simulated_frames
-from lt_lib.hardware.randomise import draw_appearances, eight_bits, recoloured
 from lt_lib.hardware.surrogate import SurrogateScene
+from lt_lib.perception.appearance import draw_appearances, eight_bits, recoloured
 from lt_lib.settings.base import require_known
 from lt_lib.settings.hardware import MatchedEncoderConfig, OpticsConfig, SessionConfig, SweepConfig
 from lt_lib.settings.streams import Stream

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from lt_lib.envs.materials import PALETTE
 from lt_lib.perception.first_layer import bags
-from lt_lib.store.states import restored
+from lt_lib.store.states import only, restored
 
 LATENT = 64
 ACTION = 3
@@ -62,14 +62,15 @@ class Frozen:
     """E and P after the freeze, without gradients, and the normalisation that was fixed before any policy existed.
 
     The weights are a flat mapping of arrays ("E.*", "P.*", "mean", "std"), the form in which they are stored and passed
-    to runs. A subclass defines E and how observations enter it.
+    to runs; an E that was not trained to predict comes without P. A subclass defines E and how observations enter it.
     """
 
     def __init__(self, encoder: nn.Module, weights: Mapping[str, np.ndarray], device: str, precision: str):
         self.device, self.dtype = torch.device(device), getattr(torch, precision)
-        self._encoder, self._predictor = encoder, Predictor()
-        for module, prefix in ((self._encoder, "E"), (self._predictor, "P")):
+        modules = {"E": encoder} | ({"P": Predictor()} if only(weights, "P") else {})
+        for prefix, module in modules.items():
             restored(module, weights, prefix).to(self.device, self.dtype).requires_grad_(False)
+        self._encoder, self._predictor = encoder, modules.get("P")
         self._mean = torch.tensor(weights["mean"], device=self.device)
         self._std = torch.tensor(weights["std"], device=self.device)
 

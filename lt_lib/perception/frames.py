@@ -15,11 +15,15 @@ ARENAS = 640  # rollouts stepped side by side
 
 
 class Rollouts(NamedTuple):
-    """R rollouts of T steps: frames of palette indices, actions in [-1, 1], poses in metres, metres, radians."""
+    """R rollouts of T steps: frames of palette indices, actions in [-1, 1], poses in metres, metres, radians.
+
+    `slab` is the blocked corridor, 0 left, 1 right; no self-supervised training looks at it.
+    """
 
     frames: UInt8[np.ndarray, "r t h w"]
     actions: Float[np.ndarray, "r t 3"]
     poses: Float[np.ndarray, "r t 3"]
+    slab: Int[np.ndarray, " r"]
 
 
 def random_rollouts(layout: Layout, rollouts: int, length: int, rng: np.random.Generator) -> Rollouts:
@@ -42,7 +46,7 @@ def _rollouts(layout: Layout, n: int, length: int, rng: np.random.Generator) -> 
         action = np.where(rng.random((n, 1)) < HOLD, action, rng.uniform(-1, 1, (n, 3)))
         actions.append(action.astype(np.float32))
         arena.step(action)
-    return Rollouts(*(np.stack(part, axis=1) for part in (frames, actions, poses)))
+    return Rollouts(*(np.stack(part, axis=1) for part in (frames, actions, poses)), slab)
 
 
 def free_poses(

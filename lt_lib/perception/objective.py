@@ -103,35 +103,57 @@ def fit(
     rng: np.random.Generator,
     report: Callable[[float], None],
 ) -> dict[str, np.ndarray]:
-    """Trains with Adam and a one-cycle rate on every step of the rollouts in random order.
+    """Trains a `Jepa` as `optimise` does; returns "loss.*" (updates,), each term before weighting.
 
-    losses    maps rollouts r (B,) and times t (B,) to the losses of the steps from t to t + 1
+    losses  maps rollouts r (B,) and times t (B,) to the losses of the steps from t to t + 1
+    """
+    scale = torch.tensor([config.prediction, config.variance, config.covariance, config.reconstruction])
+
+    def terms(r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Float[Tensor, "4"]:
+        return torch.stack(losses(r, t))
+
+    scale = scale.to(model.class_weights.device)
+    curves = optimise(model, terms, scale, rollouts, config, rng, report, lambda: model.follow(config.ema))
+    return {f"loss.{name}": curves[:, i].copy() for i, name in enumerate(Losses._fields)}
+
+
+def optimise(
+    model: nn.Module,
+    terms: Callable[[Int[np.ndarray, " b"], Int[np.ndarray, " b"]], Float[Tensor, " k"]],
+    scale: Float[Tensor, " k"],
+    rollouts: tuple[int, int],
+    config: ObjectiveConfig,
+    rng: np.random.Generator,
+    report: Callable[[float], None],
+    after: Callable[[], None] = lambda: None,
+) -> Float[np.ndarray, "updates k"]:
+    """Trains with Adam and a one-cycle rate on every step of the rollouts in random order; returns the terms' curves.
+
+    terms     maps rollouts r (B,) and times t (B,) to the terms of the loss, which `scale` weights; there is always a
+              frame t + 1
     rollouts  number and length of the rollouts
     report    receives the share of updates done
-
-    Returns "loss.*" (updates,), each term before weighting.
+    after     is called after every update
     """
     number, length = rollouts
     steps = np.argwhere(np.ones((number, length - 1), bool))  # (steps, 2): rollout, time
     updates = int(config.epochs * len(steps) / config.batch)
-    curves = np.zeros((updates, len(Losses._fields)), np.float32)  # (updates, 4)
+    curves = np.zeros((updates, len(scale)), np.float32)
     if updates:
         optimiser = torch.optim.Adam(model.parameters(), lr=config.lr)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, config.lr, total_steps=updates + 1)
         order = np.concatenate([rng.permutation(steps) for _ in range(int(np.ceil(config.epochs)))])  # (*, 2)
-    scale = torch.tensor([config.prediction, config.variance, config.covariance, config.reconstruction])
-    scale = scale.to(model.class_weights.device)
     for update in range(updates):
         r, t = order[update * config.batch : (update + 1) * config.batch].T  # (B,) each
-        terms = torch.stack(losses(r, t))  # (4,)
+        each = terms(r, t)
         optimiser.zero_grad()
-        (scale * terms).sum().backward()
+        (scale * each).sum().backward()
         optimiser.step()
         schedule.step()
-        model.follow(config.ema)
-        curves[update] = terms.detach().cpu()
+        after()
+        curves[update] = each.detach().cpu()
         report((update + 1) / updates)
-    return {f"loss.{name}": curves[:, i].copy() for i, name in enumerate(Losses._fields)}
+    return curves
 
 
 def frozen(model: Jepa, latents: Float[np.ndarray, "n 64"]) -> dict[str, np.ndarray]:
@@ -139,7 +161,11 @@ def frozen(model: Jepa, latents: Float[np.ndarray, "n 64"]) -> dict[str, np.ndar
 
     latents  E's raw latents of the training frames
     """
+    return state_of(model.encoder, "E") | state_of(model.predictor, "P") | normalisation(latents)
+
+
+def normalisation(latents: Float[np.ndarray, "n 64"]) -> dict[str, np.ndarray]:
+    """ "mean" and "std" (64,) of latents, by which frozen latents are standardised."""
     latents = latents.astype(np.float64)
-    weights = state_of(model.encoder, "E") | state_of(model.predictor, "P")
     std = latents.std(axis=0, ddof=1) + 1e-6
-    return weights | {"mean": latents.mean(axis=0).astype(np.float32), "std": std.astype(np.float32)}
+    return {"mean": latents.mean(axis=0).astype(np.float32), "std": std.astype(np.float32)}

@@ -5,17 +5,15 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from lt_lib.settings.base import Scene, Settings, Share, Training
-from lt_lib.settings.perception import EncoderConfig
+from lt_lib.settings.perception import PictureConfig
 
 
-class MatchedEncoderConfig(EncoderConfig):
+class MatchedEncoderConfig(PictureConfig):
     """Stage 1 with the camera's optics; floor and walls are recoloured in every rollout (Section Hardware)."""
 
-    decided = (*EncoderConfig.decided, "colour", "texture")
     layout: str = "matched"
     frames: PositiveInt = 102_400
-    colour: Share = 1.0  # of a material's colour that a random one replaces; 0 keeps the simulation's
-    texture: NonNegativeFloat = 0.0  # standard deviation of the blotches on floor and walls, as a share of their colour
+    colour: Share = 1.0
 
 
 class MatchedGateConfig(Training):

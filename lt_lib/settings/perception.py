@@ -26,6 +26,14 @@ class EncoderConfig(ObjectiveConfig, Training):
     """Stage 1 for the pixel encoder."""
 
 
+class PictureConfig(EncoderConfig):
+    """Stage 1 on pictures whose floor and walls are recoloured in every rollout (Section Hardware)."""
+
+    decided = (*EncoderConfig.decided, "colour", "texture")
+    colour: Share = 0.0  # of a material's colour that a random one replaces; 0 keeps the simulation's
+    texture: NonNegativeFloat = 0.0  # standard deviation of the blotches on floor and walls, as a share of their colour
+
+
 class GateConfig(Training):
     """How the freeze gates are measured: held-out rollouts, and the number of latents to show."""
 

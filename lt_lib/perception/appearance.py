@@ -1,4 +1,4 @@
-"""Appearance randomisation of floor and walls, guided by the segmentation (Section Hardware).
+"""Floor and walls in random colours, guided by the segmentation (Section Hardware).
 
 The fast camera's frames are palette indices, so each pixel names its material: floor and walls get random colours and
 blotches, everything else keeps the simulation's.
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lt_lib.envs.materials import INDEX, PALETTE
-from lt_lib.hardware.recolour import paint
+from lt_lib.perception.recolour import paint
 
 SIZES = (6, 24)  # blotches along a side of a frame, coarse and fine
 NOT_RED = 1.5  # times the larger of green and blue: no floor or wall gets as red as the slab
