@@ -97,7 +97,8 @@ def test_the_encoder_predicts_the_next_frame_of_the_same_rollout(monkeypatch):
     frames = np.arange(number * length, dtype=np.uint8).reshape(number, length, 1, 1) % 11
     frames = np.broadcast_to(frames, (number, length, 64, 64)).copy()  # each frame shows its own number
     poses, actions = np.zeros((2, number, length, 3), np.float32)
-    monkeypatch.setattr(jepa, "random_rollouts", lambda *_: Rollouts(frames, poses, actions))
+    slab = np.zeros(number, np.int64)
+    monkeypatch.setattr(jepa, "random_rollouts", lambda *_: Rollouts(frames, poses, actions, slab))
     seen, wanted = [], []
     monkeypatch.setattr(jepa.Encoder, "forward", lambda self, x: (seen.append(x), torch.zeros(len(x), 64))[1])
     monkeypatch.setattr(jepa.Jepa, "goal", lambda self, x: (wanted.append(x), torch.zeros(len(x), 64))[1])

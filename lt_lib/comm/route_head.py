@@ -21,10 +21,14 @@ class RouteHead(nn.Module):
         nn.init.zeros_(self.logits.bias)
 
     def policy(self, wire: Float[Tensor, "b w"]) -> torch.distributions.Categorical:
-        return torch.distributions.Categorical(logits=self.logits(self.hidden(wire)))
+        return self.outlook(wire)[0]
+
+    def outlook(self, wire: Float[Tensor, "b w"]) -> tuple[torch.distributions.Categorical, Float[Tensor, " b"]]:
+        """The policy and the value."""
+        hidden = self.hidden(wire)
+        return torch.distributions.Categorical(logits=self.logits(hidden)), self.value(hidden).squeeze(1)
 
     def evaluate(self, observations: Float[Tensor, "b w"], actions: Int[Tensor, " b"]):
         """Log-probability, entropy and value, each (b,)."""
-        hidden = self.hidden(observations)
-        policy = torch.distributions.Categorical(logits=self.logits(hidden))
-        return policy.log_prob(actions), policy.entropy(), self.value(hidden).squeeze(1)
+        policy, value = self.outlook(observations)
+        return policy.log_prob(actions), policy.entropy(), value

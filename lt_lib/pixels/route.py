@@ -135,20 +135,36 @@ def train_head(
     rng = Stream.HEAD.generator(seed, config.content, config.wire)
     training, held_out = read_bank(config, bank, encoder)
     width = training.contents.shape[-1]
-    channel = channel_of(config, config.batch, width, rng)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         head = RouteHead(ANCHOR + width)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
+    course = learn(head, optimiser, training, channel_of(config, config.batch, width, rng), config, rng, report)
+    greedy = evaluate(head, held_out, channel_of(config, len(held_out.contents), width, rng), rng)
+    return state_of(head, "head") | course | {f"greedy.{name}": values for name, values in greedy.items()}
+
+
+def learn(
+    head: RouteHead,
+    optimiser: torch.optim.Optimizer,
+    training: Bank,
+    channel: Channel,
+    config: HeadConfig,
+    rng: np.random.Generator,
+    report: Callable[[float], None],
+) -> dict[str, np.ndarray]:
+    """Trains a head, or anything with its two methods, on a bank's draws; returns the course of the training.
+
+    "optimal", "success", "contacts", "length", "route" (episodes,);  "entropy", "value_loss" (updates,)
+    """
     episodes, updates = [], []
     for start in range(0, config.episodes, config.batch):
         n = min(config.batch, config.episodes - start)
         entry, slab = rng.integers(0, len(training.contents), n), rng.integers(0, SLABS, n)
         wire = training.wires(channel, entry, slab)
         with torch.no_grad():
-            policy = head.policy(wire)
+            policy, value = head.outlook(wire)
             route = torch.from_numpy((rng.random(n) < policy.probs[:, 1].numpy()).astype(np.int64))
-            value = head.value(head.hidden(wire)).squeeze(1)
         played = _played(training.outcomes, entry, slab, route.numpy())
         returns = torch.from_numpy(played.pop("returns")).float()
         batch = ppo.Batch(wire, route, policy.log_prob(route), returns - value, returns)
@@ -156,14 +172,10 @@ def train_head(
         episodes.append(played | {"route": route.numpy().astype(np.int8)})
         updates.append((policy.entropy().mean().item(), statistics.value_loss))
         report((start + n) / config.episodes)
-    greedy = evaluate(head, held_out, channel_of(config, len(held_out.contents), width, rng), rng)
     names = zip(("entropy", "value_loss"), zip(*updates, strict=True), strict=True)
-    return (
-        state_of(head, "head")
-        | {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}
-        | {name: np.array(values, np.float32) for name, values in names}
-        | {f"greedy.{name}": values for name, values in greedy.items()}
-    )
+    return {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]} | {
+        name: np.array(values, np.float32) for name, values in names
+    }
 
 
 @torch.no_grad()
