@@ -148,6 +148,13 @@ def train_grid(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         team = TableTeam(inputs, config.value_gain)
+    return learn(team, grid, config, rng, report)
+
+
+def learn(
+    team: TableTeam, grid: Grid, config: GridConfig, rng: np.random.Generator, report: Callable[[float], None]
+) -> dict:
+    """Trains a team; returns what `train_grid` does."""
     optimiser = torch.optim.Adam(team.parameters(), lr=config.lr, eps=1e-5, fused=True)
     states, updates, success, length, ended = first_states(grid, config.envs, rng), [], [], [], []
     total = -(-config.steps // (config.envs * config.rollout))

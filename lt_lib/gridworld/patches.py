@@ -41,6 +41,17 @@ class PatchEncoder(nn.Module):
         return self.layers(F.one_hot(patches.long(), len(CODES)).permute(0, 3, 1, 2).float())
 
 
+class PatchProjection(nn.Module):
+    """A linear map of the one-hot cells of patches (B, 15, 15) to raw latents (B, 64)."""
+
+    def __init__(self):
+        super().__init__()
+        self.linear = nn.Linear(PATCH * PATCH * len(CODES), LATENT)
+
+    def forward(self, patches: UInt8[Tensor, "b h w"]) -> Float[Tensor, "b 64"]:
+        return self.linear(F.one_hot(patches.long(), len(CODES)).float().flatten(1))
+
+
 class Walk(NamedTuple):
     """Random rollouts: cells (R, T), the slab's corridor (R,), the action taken in each cell (R, T)."""
 
@@ -93,10 +104,11 @@ def displacement(actions: Int[np.ndarray, " b"]) -> Float[Tensor, "b 3"]:
 
 
 class FrozenPatchEncoder(Frozen):
-    """For patches (B, 15, 15) of cell codes, on the CPU in float32."""
+    """For patches (B, 15, 15) of cell codes: of the encoder, or of a projection, as the weights say; CPU, float32."""
 
     def __init__(self, weights: Mapping[str, np.ndarray]):
-        super().__init__(PatchEncoder(), weights, "cpu", "float32")
+        network = PatchProjection() if "E.linear.weight" in weights else PatchEncoder()
+        super().__init__(network, weights, "cpu", "float32")
 
     def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> UInt8[Tensor, "b h w"]:
         return torch.from_numpy(observations)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.stats import t
 from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.manifold import TSNE
@@ -71,7 +71,19 @@ def measure_gates(
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
     latents = encode(FrozenEncoder(encoder, config.device), rollouts.frames)  # (R, T, 64)
     report(0.5)
-    visible, walls = hazard_visible(rollouts.frames), wall_pixels(rollouts.frames)  # (R, T) each
+    found = probes(latents, hazard_visible(rollouts.frames), wall_pixels(rollouts.frames))
+    few = np.linspace(0, latents.shape[1] - 1, min(SAMPLED, latents.shape[1])).astype(int)
+    sample = {"latent.sample": latents[:, few].astype(np.float32)}
+    return found._asdict() | sample | _picture(rollouts, latents, config.shown, rng)
+
+
+def probes(
+    latents: Float[np.ndarray, "r t 64"], visible: Bool[np.ndarray, "r t"], walls: Int[np.ndarray, "r t"]
+) -> Measured:
+    """Linear probes of whether the slab shows and of how many pixels are wall, fitted on some rollouts, and the rank.
+
+    visible, walls  what the frames show, for the probes alone
+    """
     cut = int(len(latents) * PROBE_SHARE)
     train, test = latents[:cut].reshape(-1, LATENT), latents[cut:].reshape(-1, LATENT)  # (frames, 64) each
     probe = LogisticRegression(max_iter=2000).fit(train, visible[:cut].ravel())
@@ -79,7 +91,7 @@ def measure_gates(
     low, high = t.interval(0.95, len(right) - 1, loc=right.mean(), scale=right.std(ddof=1) / np.sqrt(len(right)))
     wall_probe = LinearRegression().fit(train, walls[:cut].ravel())
     commoner = visible[:cut].mean() > 0.5
-    found = Measured(
+    return Measured(
         float(right.mean()),
         float(low),
         float(min(high, 1.0)),
@@ -88,9 +100,6 @@ def measure_gates(
         effective_rank(latents.reshape(-1, LATENT)),
         effective_rank(latents.reshape(-1, LATENT), power=2),
     )
-    few = np.linspace(0, latents.shape[1] - 1, min(SAMPLED, latents.shape[1])).astype(int)
-    sample = {"latent.sample": latents[:, few].astype(np.float32)}
-    return found._asdict() | sample | _picture(rollouts, latents, config.shown, rng)
 
 
 def _picture(rollouts, latents, n: int, rng: np.random.Generator) -> dict:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lt_lib import ppo
@@ -36,7 +36,7 @@ class Bank(NamedTuple):
     outcomes: Outcomes  # (E, slab, route)
     commit_step: int
 
-    def take(self, entries: slice) -> "Bank":
+    def take(self, entries: slice | Bool[np.ndarray, " e"]) -> "Bank":
         kept = (values[entries] for values in self[:3])
         return Bank(*kept, Outcomes(*(values[entries] for values in self.outcomes)), self.commit_step)
 

@@ -24,6 +24,7 @@ from lt_lib.report.claims import (
     Claim,
     Finding,
     Findings,
+    Notebook,
     verdict,
 )
 from lt_lib.report.firmness import FRAGILE
@@ -96,7 +97,8 @@ def read_findings(outputs: Path, claims: Mapping[str, Claim], profile: str) -> d
     profile, an id in two files, an id that is unknown or belongs to another notebook, and a notebook that lacks one of
     its ids without listing it as pending.
     """
-    files = [_read_results(path, profile) for path in sorted((Path(outputs) / "results").glob("*.json"))]
+    paths = (Path(outputs) / "results" / f"{name}.json" for name in Notebook.__args__)  # none beyond the paper
+    files = [_read_results(path, profile) for path in paths if path.exists()]
     owners: dict[str, str] = {}
     for results in files:
         for name in results.findings:

@@ -24,7 +24,9 @@ GIVEN = ("profile", "outputs", "workers")
 
 def profile_names(root: Path = ROOT) -> list[str]:
     """The profiles of a project: every YAML file in params/ but those of the paper."""
-    return sorted(path.stem for path in (root / "params").glob("*.yaml") if path.stem not in ("claims", "inferred"))
+    return sorted(
+        path.stem for path in (root / "params").glob("*.yaml") if path.stem not in ("claims", "inferred", "predictions")
+    )
 
 
 def notebook_names(root: Path = ROOT) -> list[str]:

@@ -27,6 +27,11 @@ class Stream(IntEnum):
     PATCH_ENCODER = 14
     MATCHED_ENCODER = 15
     MATCHED_GATES = 16
+    SENDER = 17  # a sender's training, beyond the frames it shares with the encoder's
+    LADDER = 18  # scenes of a rung
+    READER = 19  # a head that reads a sender on a rung
+    SENDER_GATES = 20
+    LAYOUTS = 21
 
     def generator(self, seed: int, *condition: str) -> np.random.Generator:
         """The generator of this stream for a seed, and for a condition where several are compared."""

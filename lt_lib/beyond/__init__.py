@@ -1,0 +1,1 @@
+"""What a referee would ask and the paper does not say: experiments beyond it, outside its scoreboard."""

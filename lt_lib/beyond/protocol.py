@@ -1,0 +1,190 @@
+"""The controls, stage by stage, as requests to the run store: senders, ladder, variance split, gridworld's twin.
+
+The paper's encoder, executor, episode bank, channel and head are held fixed; what the scout sends is what varies.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lt_lib.beyond.grid import GRID_SENDERS, train_grid_end_to_end, train_grid_reader
+from lt_lib.beyond.ladder import label
+from lt_lib.beyond.readers import train_end_to_end, train_readers
+from lt_lib.beyond.senders import SENDERS, measure_sender
+from lt_lib.beyond.variance import perfect_bank
+from lt_lib.gridworld.protocol import GridProtocol
+from lt_lib.perception.jepa import train_encoder
+from lt_lib.pixels.protocol import SEED, PixelProtocol
+from lt_lib.settings.base import everywhere
+from lt_lib.settings.beyond import (
+    ControlsConfig,
+    EndToEndConfig,
+    GridReaderConfig,
+    PatchSenderConfig,
+    ReaderConfig,
+    Rung,
+    SenderConfig,
+)
+from lt_lib.settings.perception import EncoderConfig
+from lt_lib.settings.profiles import validated
+from lt_lib.store.run import Result, Run
+from lt_lib.store.runs import RunStore, fetch_by_name
+from lt_lib.store.states import only
+
+PAPER_S, END_TO_END = "jepa", "end_to_end"
+DRAWN = ("untrained", "random")  # senders of which there are several, since nothing but their seed makes them
+RETRAINED = ("jepa", "contrastive", "autoencoder", "pca", "supervised")  # also trained on frames in random colours
+Heads = dict[tuple[str, str], list[Result]]  # what heads learned, by sender and rung
+
+
+@dataclass(frozen=True)
+class ControlProtocol:
+    """The stages at one size."""
+
+    sizes: ControlsConfig
+    pixels: PixelProtocol
+    grid: GridProtocol
+
+    @classmethod
+    def of(cls, controls: Mapping[str, Any], pixels: PixelProtocol, gridworld: Mapping[str, Any]) -> "ControlProtocol":
+        """From a notebook's parameters. Raises UserError for unusable ones."""
+        sizes = validated(ControlsConfig, "controls", dict(controls))
+        shared = {"layout": pixels.layout, "device": pixels.sizes.encoder.device}
+        sizes = sizes.model_copy(update={name: everywhere(each, shared) for name, each in sizes})
+        return cls(sizes, pixels, GridProtocol.of(gridworld, pixels.store.workers))
+
+    @property
+    def store(self) -> RunStore:
+        return self.pixels.store
+
+    def senders(self, encoder: Result, colour: float = 0.0, texture: float = 0.0) -> dict[str, list[Result]]:
+        """Every frozen sender of one set of training frames, by name; several of those that are drawn at random.
+
+        encoder          the paper's, which is the JEPA sender of the plain frames
+        colour, texture  how random floor and walls of the training frames are
+        """
+        names = RETRAINED if colour or texture else [name for name in SENDERS if name != PAPER_S]
+        looks = {"colour": colour, "texture": texture}
+        runs = {
+            (name, seed): Run(
+                SENDERS[name].train,
+                self.sizes.sender.model_copy(update={"kind": name, **looks, **SENDERS[name].changes}),
+                seed,
+            )
+            for name in names
+            for seed in range(self.sizes.drawn if name in DRAWN else 1)
+        }
+        trained = fetch_by_name(self.store.fetch, runs, "senders")
+        ours = {} if colour or texture else {PAPER_S: [encoder]}
+        return {name: [frozen(each) for each in results] for name, results in (ours | trained).items()}
+
+    def gate_reports(self, senders: Mapping[str, list[Result]], colour: float = 0.0, texture: float = 0.0):
+        """Probes and rank of every sender, on frames that look like its training's; see `perception.gates.Measured`."""
+        config = self.sizes.gates.model_copy(update={"colour": colour, "texture": texture})
+        runs = {
+            (name, seed): Run(measure_sender, config, SEED, {"sender": sender})
+            for name, several in senders.items()
+            for seed, sender in enumerate(several)
+        }
+        return fetch_by_name(self.store.fetch, runs, "gates of senders")
+
+    def read(self, senders: Mapping[str, list[Result]], rungs: Sequence[Rung], bank: Result) -> Heads:
+        """Heads that read each sender on each rung; one result per sender of a name."""
+        runs = {
+            (name, label(rung), seed): Run(
+                train_readers,
+                ReaderConfig(**self._reading(), sender=f"{name} {seed}", rung=rung),
+                SEED,
+                {"bank": bank, "sender": sender},
+            )
+            for name, several in senders.items()
+            for rung in rungs
+            for seed, sender in enumerate(several)
+        }
+        return _by_sender_and_rung(runs, self.store.fetch(list(runs.values()), "readers"))
+
+    def learned_with_the_head(self, rungs: Sequence[Rung], bank: Result) -> Heads:
+        """Senders that learn with their head, on each rung."""
+        runs = {
+            (END_TO_END, label(rung), seed): Run(
+                train_end_to_end,
+                EndToEndConfig(**self._reading(), sender=END_TO_END, rung=rung),
+                seed,
+                {"bank": bank},
+            )
+            for rung in rungs
+            for seed in range(self.sizes.end_to_end)
+        }
+        return _by_sender_and_rung(runs, self.store.fetch(list(runs.values()), "end to end"))
+
+    def varied(self, rung: Rung) -> np.ndarray:
+        """Route optimality (layouts, encoders, heads) on one rung of JEPA encoders trained in other arenas."""
+        sizes = self.sizes.variance
+        trained = self.sizes.sender.model_copy(update={"frames": sizes.frames})
+        encoders = {
+            (layout, seed): Run(train_encoder, _plain(trained, layout), seed)
+            for layout in sizes.layouts
+            for seed in range(sizes.encoders)
+        }
+        trained_there = self.store.fetch(list(encoders.values()), "encoders of layouts")
+        reading = self._reading() | {"heads": sizes.heads, "repeats": 1}
+        runs = [
+            Run(
+                train_readers,
+                ReaderConfig(**reading | {"layout": layout}, sender=f"jepa {seed}", rung=rung),
+                SEED,
+                {"bank": perfect_bank(layout, sizes.draws), "sender": frozen(encoder)},
+            )
+            for (layout, seed), encoder in zip(encoders, trained_there, strict=True)
+        ]
+        greedy = [result["greedy"] for result in self.store.fetch(runs, "readers in other layouts")]
+        return np.reshape(greedy, (len(sizes.layouts), sizes.encoders, sizes.heads))
+
+    def twin(self) -> dict[str, list[Result]]:
+        """Receivers of the gridworld that read each sender there, and one that learns with its sender."""
+        grid, encoder = self.grid, self.grid.encoder_weights()
+        shared = {name: getattr(grid.encoder, name) for name in ("layout", "frames", "rollout", "epochs")}
+        trainings = [
+            Run(sender.train, PatchSenderConfig(kind=name, **shared | dict(sender.changes)), SEED)
+            for name, sender in GRID_SENDERS.items()
+        ]
+        senders = dict(zip(GRID_SENDERS, self.store.fetch(trainings, "patch senders"), strict=True))
+        eyes, policy = {"encoder": grid.frozen(encoder)}, grid.grid.model_dump(exclude={"layout_digest"})
+        runs = {
+            (name, seed): Run(
+                train_grid_reader,
+                GridReaderConfig(**policy, sender=name),
+                seed,
+                eyes | {"sender": frozen(sender)},
+            )
+            for name, sender in senders.items()
+            for seed in range(self.sizes.grid_seeds)
+        } | {
+            (END_TO_END, seed): Run(train_grid_end_to_end, grid.grid, seed, eyes)
+            for seed in range(self.sizes.grid_seeds)
+        }
+        return fetch_by_name(self.store.fetch, runs, "gridworld receivers")
+
+    def _reading(self) -> dict[str, Any]:
+        head = self.pixels.sizes.head.model_dump(exclude={"layout_digest", "content", "wire"})
+        return head | {name: getattr(self.sizes, name) for name in ("repeats", "heads", "share")}
+
+
+def frozen(sender: Result) -> Result:
+    """What a sender needs to send: E and the normalisation."""
+    return only(sender, "E") | {name: sender[name] for name in ("mean", "std")}
+
+
+def _plain(config: SenderConfig, layout: str) -> EncoderConfig:
+    """Stage 1's own settings among a sender's, in another layout."""
+    fields = {name: getattr(config, name) for name in EncoderConfig.model_fields}
+    return EncoderConfig(**fields | {"layout": layout})
+
+
+def _by_sender_and_rung(runs: Mapping[tuple[str, str, int], Run], results: Sequence[Result]) -> Heads:
+    heads: Heads = {}
+    for (name, rung, _), result in zip(runs, results, strict=True):
+        heads.setdefault((name, rung), []).append(result)
+    return heads

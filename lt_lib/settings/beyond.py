@@ -1,0 +1,105 @@
+"""Settings of the experiments beyond the paper."""
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from lt_lib.settings.base import Settings, Share
+from lt_lib.settings.gridworld import GridConfig, PatchEncoderConfig
+from lt_lib.settings.perception import PictureConfig
+from lt_lib.settings.pixels import HeadConfig
+
+
+class SenderConfig(PictureConfig):
+    """Training of one sender: the paper's frames, batch, rate and number of updates for every kind that is trained."""
+
+    decided = (*PictureConfig.decided, "kind")
+    kind: str = "jepa"  # a name in beyond.senders.SENDERS
+    every: PositiveInt = 10  # the principal components take each such frame of a rollout
+    apart: PositiveInt = 4  # most frames between the two views of a contrastive pair
+    temperature: PositiveFloat = 0.1  # of the contrastive loss
+
+
+class SenderGateConfig(PictureConfig):
+    """How a sender's probes and rank are measured: held-out rollouts in the appearances of its own training."""
+
+    rollouts: Annotated[int, Field(ge=10)] = 160
+    length: PositiveInt = 32
+
+
+class Rung(Settings):
+    """How one scene of the ladder differs from the paper's, for every sender alike; the defaults are the paper's."""
+
+    appearance: Share = 0.0  # of floor's and walls' colour that a random one replaces, drawn per frame
+    exposure: NonNegativeFloat = 0.0  # stops, standard deviation of a frame's brightness
+    noise: Share = 0.0  # of pixels that show a random material
+    redness: Share | None = None  # of an upright object beside the scout's view of the slab, from yellow to its red
+    back: NonNegativeFloat = 0.0  # metres that the scout stands farther from the slab
+    jitter: Annotated[float, Field(ge=1)] = 1.0  # times the jitter of the scout's post, place and heading
+    anywhere: bool = False  # the scout stands anywhere beyond the barrier from where it sees the slab
+    least: PositiveInt = 40  # pixels of the slab in one placement or the other that count as seeing it
+
+    @model_validator(mode="after")
+    def _one_post(self) -> "Rung":
+        if self.anywhere and (self.back or self.jitter > 1):
+            raise ValueError("a scout that stands anywhere has no post to move back from or to jitter about")
+        return self
+
+
+class ReaderConfig(HeadConfig):
+    """Heads that learn to read one sender on one rung (Section Route head, with other senders)."""
+
+    decided = (*HeadConfig.decided, "sender", "rung")
+    sender: str  # what the heads read; names their random stream
+    rung: Rung = Rung()
+    repeats: PositiveInt = 2  # scenes per draw of the bank
+    heads: PositiveInt = 5  # seeds
+    share: Annotated[float, Field(gt=0, le=1)] = 0.1  # of the episodes that a second set of heads gets
+
+
+class EndToEndConfig(ReaderConfig):
+    """A sender that learns with its head, by the receiver's policy gradient."""
+
+    sender_lr: PositiveFloat = 1e-3  # of the sender's network, as in stage 1; the head keeps its own rate
+
+
+class PatchSenderConfig(PatchEncoderConfig):
+    """Training of one sender of the gridworld, on the paper's walks."""
+
+    decided = (*PatchEncoderConfig.decided, "kind")
+    kind: str = "jepa"  # a name in beyond.grid.GRID_SENDERS
+    apart: PositiveInt = 4  # most steps between the two views of a contrastive pair
+    temperature: PositiveFloat = 0.1  # of the contrastive loss
+
+
+class GridReaderConfig(GridConfig):
+    """The gridworld's receiver, trained on one sender."""
+
+    decided = (*GridConfig.decided, "sender")
+    sender: str  # what the scout sends; names the random stream
+
+
+class VarianceConfig(Settings):
+    """The split of the variance over layouts, encoders and heads."""
+
+    layouts: Annotated[tuple[str, ...], Field(min_length=2)]
+    encoders: Annotated[int, Field(ge=2)] = 5
+    heads: Annotated[int, Field(ge=2)] = 5
+    frames: PositiveInt = 51_200  # of each encoder's training
+    draws: PositiveInt = 2_048  # of the scene
+
+
+class ControlsConfig(Settings):
+    """All settings of the controls in one parameter; heads and channel are those of `pixel_study`."""
+
+    sender: SenderConfig = SenderConfig()
+    gates: SenderGateConfig = SenderGateConfig()
+    colour: Share = 1.0  # of the second set of training frames: how random floor and walls are
+    texture: NonNegativeFloat = 0.1
+    drawn: PositiveInt = 3  # untrained encoders, and random projections
+    repeats: PositiveInt = 2  # scenes per draw of the bank
+    heads: PositiveInt = 5  # seeds
+    share: Annotated[float, Field(gt=0, le=1)] = 0.1  # of the episodes that a second set of heads gets
+    end_to_end: PositiveInt = 2  # seeds per rung of the sender that learns with its head
+    variance: VarianceConfig
+    grid_seeds: PositiveInt = 5
