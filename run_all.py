@@ -1,6 +1,6 @@
 """The whole reproduction: executes the notebooks in order and reports how each went.
 
-    python run_all.py [--profile full|quick|smoke] [--only NAME ...] [--workers N | --scheduler ADDRESS]
+    python run_all.py [--profile full|quick|smoke] [--only NAME ... | --beyond] [--workers N | --scheduler ADDRESS]
                        [--outputs DIR] [--runs DIR] [--list]
 
 Exit status: 0 success, 1 a notebook failed, 2 bad input (nothing was computed), 129, 130 or 143 interrupted by a closed
@@ -43,6 +43,8 @@ NEEDS = {
     "07_corruption": ("03_gridworld", "04_pixels"),
     "10_speed": ("03_gridworld", "04_pixels"),
 }
+# The paper's notebooks come before this number; those from it on, beyond the paper, run with --beyond.
+BEYOND = "11"
 # Parameters naming things that may be missing or unfit; checked before computing.
 INPUTS = ("device", "layout", "weights", "seeds", "gridworld", "peek_layout", "frames", "effects", "gate_file")
 # A notebook whose code calls this draws with OpenGL.
@@ -151,12 +153,15 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="run_all.py", description="Executes the notebooks in order and reports how each went.")
     parser.add_argument("--profile", default="full", help="a file in params/: full (default), quick or smoke")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="notebooks, such as 04 or pixels")
+    parser.add_argument("--beyond", action="store_true", help="the notebooks beyond the paper, instead of the paper's")
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes at a time (0: one per core)")
     parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler, tcp://HOST:PORT")
     parser.add_argument("--outputs", type=Path, metavar="DIR", help="folder of outputs; default: outputs/<profile>")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="folder of finished runs; default: outputs/runs")
     parser.add_argument("--list", action="store_true", help="list the notebooks and stop")
     options = parser.parse_args(arguments)
+    if options.only and options.beyond:
+        raise UserError("argument --beyond: --only names notebooks of either kind; leave one of them out")
     if options.workers < 0:
         raise UserError(f"argument --workers: expected 0 or more, got {options.workers}")
     if options.workers and options.scheduler:
@@ -167,7 +172,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 def make_plan(options: argparse.Namespace, root: Path) -> Plan:
     """Raises UserError for anything unknown or mistyped in the options, the profile or the notebooks."""
     profile = load_profile(options.profile, root)
-    chosen = choose(options.only, list(profile)) if options.only else list(profile)
+    meant = [name for name in profile if (name >= BEYOND) == options.beyond]
+    chosen = choose(options.only, list(profile)) if options.only else meant
     # The default stays empty, so that executed notebooks do not depend on the project's location.
     outputs = str(options.outputs.resolve()) if options.outputs else ""
     workers = options.scheduler or options.workers

@@ -5,6 +5,7 @@ The paper's encoder, executor, episode bank, channel and head are held fixed; wh
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,11 @@ from lt_lib.beyond.ladder import label
 from lt_lib.beyond.readers import train_end_to_end, train_readers
 from lt_lib.beyond.senders import SENDERS, measure_sender
 from lt_lib.beyond.variance import perfect_bank
+from lt_lib.envs.layout import load_layout
 from lt_lib.gridworld.protocol import GridProtocol
+from lt_lib.perception.gates import Measured
 from lt_lib.perception.jepa import train_encoder
+from lt_lib.perception.weights import save_frozen
 from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.settings.base import everywhere
 from lt_lib.settings.beyond import (
@@ -90,6 +94,15 @@ class ControlProtocol:
         }
         return fetch_by_name(self.store.fetch, runs, "gates of senders")
 
+    def save(
+        self, senders: Mapping[str, list[Result]], reports: Mapping[str, list[Result]], folder: Path, suffix: str = ""
+    ) -> None:
+        """Saves the first sender of every name as sender_<name><suffix>, its gates' measures beside it."""
+        layout = load_layout(self.pixels.layout)
+        for name, (sender, *_) in senders.items():
+            facts = {"gates": {field: reports[name][0][field] for field in Measured._fields}}
+            save_frozen(folder, f"sender_{name}{suffix}", sender, layout, facts)
+
     def read(self, senders: Mapping[str, list[Result]], rungs: Sequence[Rung], bank: Result) -> Heads:
         """Heads that read each sender on each rung; one result per sender of a name."""
         runs = {
@@ -139,7 +152,7 @@ class ControlProtocol:
             )
             for (layout, seed), encoder in zip(encoders, trained_there, strict=True)
         ]
-        greedy = [result["greedy"] for result in self.store.fetch(runs, "readers in other layouts")]
+        greedy = [result["greedy"].mean(axis=1) for result in self.store.fetch(runs, "readers in other layouts")]
         return np.reshape(greedy, (len(sizes.layouts), sizes.encoders, sizes.heads))
 
     def twin(self) -> dict[str, list[Result]]:

@@ -58,8 +58,8 @@ def train_readers(
     """Heads of `config.heads` seeds that read one sender on one rung.
 
     "optimal"             (heads, episodes) of sampled choices, in order
-    "greedy", "few"       (heads,) route optimality of greedy choices on held-out scenes, each under both placements:
-                          after all episodes, and of other heads after `config.share` of them
+    "greedy", "few"       (heads, scenes) of greedy choices on held-out scenes, each under both placements: after all
+                          episodes, and of other heads after `config.share` of them
     "probe"               accuracy of a linear probe of the blocked corridor on what is sent in held-out scenes
     "slab_pixels"         (e, slab) of the frames
     """
@@ -74,8 +74,8 @@ def train_readers(
     whole, brief = zip(*heads, strict=True)
     return {
         "optimal": np.stack([optimal for optimal, _ in whole]),
-        "greedy": np.array([greedy for _, greedy in whole]),
-        "few": np.array([greedy for _, greedy in brief]),
+        "greedy": np.stack([greedy for _, greedy in whole]),
+        "few": np.stack([greedy for _, greedy in brief]),
         "probe": probe(training.contents, held_out.contents),
         "slab_pixels": scenes.slab_pixels.astype(np.int16),
     }
@@ -87,8 +87,10 @@ def sent(sender: PictureEncoder, pictures: UInt8[np.ndarray, "e slab h w 3"]) ->
     return torch.from_numpy(latents).unflatten(0, pictures.shape[:2])
 
 
-def read(config: ReaderConfig, seed: int, training: Bank, held_out: Bank) -> tuple[Bool[np.ndarray, " n"], float]:
-    """Trains one head; returns whether each training episode's route was the free one, and `greedy_optimality`."""
+def read(
+    config: ReaderConfig, seed: int, training: Bank, held_out: Bank
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " scenes"]]:
+    """Trains one head; returns whether each training episode's route was the free one, and `greedy_choices`."""
     rng = Stream.READER.generator(seed, config.sender, label(config.rung), str(config.episodes))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
@@ -96,19 +98,20 @@ def read(config: ReaderConfig, seed: int, training: Bank, held_out: Bank) -> tup
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     channel = channel_of(config, config.batch, LATENT, rng)
     course = learn(head, optimiser, training, channel, config, rng, lambda _: None)
-    return course["optimal"], greedy_optimality(config, head, held_out, rng)
+    return course["optimal"], greedy_choices(config, head, held_out, rng)
 
 
 @torch.no_grad()
-def greedy_optimality(config: ReaderConfig, head: RouteHead, held_out: Bank, rng: np.random.Generator) -> float:
-    """Share of held-out scenes in which the likelier route is the free one, each scene under both placements.
+def greedy_choices(
+    config: ReaderConfig, head: RouteHead, held_out: Bank, rng: np.random.Generator
+) -> Bool[np.ndarray, " scenes"]:
+    """Whether the likelier route is the free one, in every held-out scene under both placements.
 
-    A head that always takes the same corridor, or that reads nothing, has one half.
+    A head that always takes the same corridor, or that reads nothing, is right in one half.
     """
     entry, slab = (axis.ravel() for axis in np.indices((len(held_out.contents), len(SIDES))))
     channel = channel_of(config, len(entry), held_out.contents.shape[-1], rng)
-    route = head.policy(held_out.wires(channel, entry, slab)).logits.argmax(1).numpy()
-    return float((route != slab).mean())
+    return head.policy(held_out.wires(channel, entry, slab)).logits.argmax(1).numpy() != slab
 
 
 def probe(training: Float[Tensor, "e slab c"], held_out: Float[Tensor, "k slab c"]) -> float:
@@ -153,7 +156,7 @@ def train_end_to_end(
 
     "E.*", "mean", "std"  the sender, frozen afterwards like any other
     "optimal"             (episodes,) of sampled choices, in order
-    "greedy"              route optimality of greedy choices on held-out scenes
+    "greedy"              (scenes,) of greedy choices on held-out scenes, each under both placements
     """
     rng = Stream.READER.generator(seed, "end to end", label(config.rung))
     scenes = scenes_of(config, bank)
@@ -170,6 +173,6 @@ def train_end_to_end(
     )
     with torch.no_grad():
         seen = policy.said(training.contents.flatten(0, 1)[:SAMPLE])
-    greedy = greedy_optimality(config, policy, held_out, rng)
+    greedy = greedy_choices(config, policy, held_out, rng)
     kept = state_of(policy.encoder, "E") | normalisation(seen.numpy())
     return kept | {"optimal": course["optimal"], "greedy": greedy}

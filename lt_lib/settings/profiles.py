@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
 from lt_lib.settings.base import ROOT, UserError, refuse_decided, require_known
+from lt_lib.settings.beyond import ControlsConfig, Rung
 from lt_lib.settings.gridworld import GridworldConfig, Scaled
 from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, RailsConfig, SessionsConfig
 from lt_lib.settings.learnability import Budget, PointMassConfig
@@ -20,6 +21,7 @@ from lt_lib.settings.velocity import Configuration, NavigatorConfig, Pretraining
 
 # What run_all.py gives to every notebook; a profile may not
 GIVEN = ("profile", "outputs", "workers")
+NO_PROFILES = ("claims", "inferred", "predictions")  # files in params/ with another content
 
 
 def profile_names(root: Path = ROOT) -> list[str]:
@@ -194,4 +196,6 @@ SECTIONS: dict[str, Any] = {
     "simulated": Annotated[int, Field(ge=2)],
     "effects": Annotated[list[str], Field(min_length=1)],
     "device": Literal["auto", "cpu", "cuda"],
+    "controls": ControlsConfig,
+    "rungs": Annotated[list[Rung], Field(min_length=1)],
 }
