@@ -46,7 +46,19 @@ NEEDS = {
 # The paper's notebooks come before this number; those from it on, beyond the paper, run with --beyond.
 BEYOND = "11"
 # Parameters naming things that may be missing or unfit; checked before computing.
-INPUTS = ("device", "layout", "weights", "seeds", "gridworld", "peek_layout", "frames", "effects", "gate_file")
+INPUTS = (
+    "device",
+    "layout",
+    "weights",
+    "seeds",
+    "gridworld",
+    "peek_layout",
+    "frames",
+    "effects",
+    "gate_file",
+    "controls",
+    "rungs",
+)
 # A notebook whose code calls this draws with OpenGL.
 DRAWS = "require_opengl()"
 # Signals that end us as Ctrl-C does, where the system has them; SIGHUP is a closed terminal.

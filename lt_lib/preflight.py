@@ -26,7 +26,7 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
     """Raises a one-line UserError for parameters that cannot work.
 
     These are a missing device, an impossible or revealing layout, unusable weights, an unknown condition or camera
-    effect, an invalid gate file, and a faulty folder of real frames.
+    effect, an invalid gate file, a faulty folder of real frames, and a ladder without a rung that is predicted.
     """
     if "device" in parameters:
         from lt_lib.settings.devices import computing_device
@@ -51,6 +51,8 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
         _check_hardware(parameters, root)
     if "gridworld" in parameters:
         _check_gridworld(parameters)
+    if "controls" in parameters:
+        _check_controls(parameters)
 
 
 def check_opengl() -> None:
@@ -78,6 +80,16 @@ def _check_hardware(parameters: Mapping[str, Any], root: Path) -> None:
     read_gates(root / parameters["gate_file"])
     if parameters["frames"]:
         read_sessions(root / parameters["frames"])
+
+
+def _check_controls(parameters: Mapping[str, Any]) -> None:
+    from lt_lib.beyond.protocol import read_rungs
+    from lt_lib.envs.layout import load_layout
+    from lt_lib.envs.occlusion import require_occlusion
+
+    read_rungs(parameters["rungs"])
+    for name in parameters["controls"]["variance"]["layouts"]:
+        require_occlusion(load_layout(name))
 
 
 def _check_gridworld(parameters: Mapping[str, Any]) -> None:

@@ -57,13 +57,13 @@ def scouts(
 
 
 def objects(layout: Layout, scout: Float[np.ndarray, "e 3"], rng: np.random.Generator) -> Float[np.ndarray, "e 2"]:
-    """A place in front of each scout for an upright object of the robot's size, clear of walls and of both slabs."""
+    """A free place beyond the barrier in front of each scout, for an upright object of the robot's size."""
     half, radius = np.deg2rad(layout.camera.fov) / 2, layout.robot.radius
     out, missing = np.empty((len(scout), 2)), np.ones(len(scout), bool)
     for _ in range(TRIES):
         away, aside = rng.uniform(OBJECT_NEAR, OBJECT_FAR, len(scout)), rng.uniform(-half, half, len(scout))
         x, y = (scout[:, :2] + away[:, None] * _directions(scout[:, 2] + aside)).T
-        good = layout.free(x, y, radius) & (_slab_distance(layout, x, y) > radius)
+        good = layout.free(x, y, radius) & (_slab_distance(layout, x, y) > radius) & (x > layout.barrier[1])
         out[missing & good] = np.column_stack([x, y])[missing & good]
         missing &= ~good
         if not missing.any():

@@ -21,7 +21,7 @@ from lt_lib.perception.gates import Measured
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import save_frozen
 from lt_lib.pixels.protocol import SEED, PixelProtocol
-from lt_lib.settings.base import everywhere
+from lt_lib.settings.base import everywhere, require_known
 from lt_lib.settings.beyond import (
     ControlsConfig,
     EndToEndConfig,
@@ -40,6 +40,8 @@ from lt_lib.store.states import only
 PAPER_S, END_TO_END = "jepa", "end_to_end"
 DRAWN = ("untrained", "random")  # senders of which there are several, since nothing but their seed makes them
 RETRAINED = ("jepa", "contrastive", "autoencoder", "pca", "supervised")  # also trained on frames in random colours
+# Rungs that a prediction speaks of
+HERE, NOISE, ANYWHERE, RECOLOURED = "the paper's scene", "noise 0.6", "anywhere", "appearance 1 + anywhere"
 Heads = dict[tuple[str, str], list[Result]]  # what heads learned, by sender and rung
 
 
@@ -63,30 +65,32 @@ class ControlProtocol:
     def store(self) -> RunStore:
         return self.pixels.store
 
-    def senders(self, encoder: Result, colour: float = 0.0, texture: float = 0.0) -> dict[str, list[Result]]:
-        """Every frozen sender of one set of training frames, by name; several of those that are drawn at random.
+    def senders(self, encoder: Result) -> dict[str, list[Result]]:
+        """Every frozen sender by name, several of those that are drawn; the JEPA sender is the paper's encoder.
 
-        encoder          the paper's, which is the JEPA sender of the plain frames
-        colour, texture  how random floor and walls of the training frames are
+        encoder  the paper's
         """
-        names = RETRAINED if colour or texture else [name for name in SENDERS if name != PAPER_S]
-        looks = {"colour": colour, "texture": texture}
+        names = [name for name in SENDERS if name != PAPER_S]
+        return {PAPER_S: [frozen(encoder)]} | self._trained(names, self.sizes.sender)
+
+    def recoloured_senders(self) -> dict[str, list[Result]]:
+        """Some senders trained on frames whose floor and walls have random colours."""
+        return self._trained(RETRAINED, self.sizes.recoloured.model_copy(update={"colour": self.sizes.colour}))
+
+    def _trained(self, names: Sequence[str], config: SenderConfig) -> dict[str, list[Result]]:
         runs = {
             (name, seed): Run(
-                SENDERS[name].train,
-                self.sizes.sender.model_copy(update={"kind": name, **looks, **SENDERS[name].changes}),
-                seed,
+                SENDERS[name].train, config.model_copy(update={"kind": name, **SENDERS[name].changes}), seed
             )
             for name in names
             for seed in range(self.sizes.drawn if name in DRAWN else 1)
         }
         trained = fetch_by_name(self.store.fetch, runs, "senders")
-        ours = {} if colour or texture else {PAPER_S: [encoder]}
-        return {name: [frozen(each) for each in results] for name, results in (ours | trained).items()}
+        return {name: [frozen(each) for each in results] for name, results in trained.items()}
 
-    def gate_reports(self, senders: Mapping[str, list[Result]], colour: float = 0.0, texture: float = 0.0):
+    def gate_reports(self, senders: Mapping[str, list[Result]], colour: float = 0.0) -> dict[str, list[Result]]:
         """Probes and rank of every sender, on frames that look like its training's; see `perception.gates.Measured`."""
-        config = self.sizes.gates.model_copy(update={"colour": colour, "texture": texture})
+        config = self.sizes.gates.model_copy(update={"colour": colour})
         runs = {
             (name, seed): Run(measure_sender, config, SEED, {"sender": sender})
             for name, several in senders.items()
@@ -183,6 +187,15 @@ class ControlProtocol:
     def _reading(self) -> dict[str, Any]:
         head = self.pixels.sizes.head.model_dump(exclude={"layout_digest", "content", "wire"})
         return head | {name: getattr(self.sizes, name) for name in ("repeats", "heads", "share")}
+
+
+def read_rungs(rungs: Sequence[Mapping[str, Any]]) -> list[Rung]:
+    """The rungs of a notebook's parameter. Raises UserError for an unusable one, or if one lacks that is predicted."""
+    ladder = validated(list[Rung], "rungs", list(rungs))
+    require_known(
+        (HERE, NOISE, ANYWHERE, RECOLOURED), [label(rung) for rung in ladder], "rung", "rungs: predicted but "
+    )
+    return ladder
 
 
 def frozen(sender: Result) -> Result:

@@ -17,7 +17,7 @@ from lt_lib.perception.encoder import LATENT, Encoder
 from lt_lib.perception.objective import normalisation
 from lt_lib.perception.pictures import PIXELS, SAMPLE, PictureEncoder
 from lt_lib.pixels.episodes import Outcomes, held_out_draws
-from lt_lib.pixels.route import Bank, channel_of, learn
+from lt_lib.pixels.route import Bank, Chooser, channel_of, learn
 from lt_lib.settings.beyond import EndToEndConfig, ReaderConfig
 from lt_lib.settings.streams import Stream
 from lt_lib.store.states import state_of
@@ -103,7 +103,7 @@ def read(
 
 @torch.no_grad()
 def greedy_choices(
-    config: ReaderConfig, head: RouteHead, held_out: Bank, rng: np.random.Generator
+    config: ReaderConfig, head: Chooser, held_out: Bank, rng: np.random.Generator
 ) -> Bool[np.ndarray, " scenes"]:
     """Whether the likelier route is the free one, in every held-out scene under both placements.
 
@@ -111,7 +111,8 @@ def greedy_choices(
     """
     entry, slab = (axis.ravel() for axis in np.indices((len(held_out.contents), len(SIDES))))
     channel = channel_of(config, len(entry), held_out.contents.shape[-1], rng)
-    return head.policy(held_out.wires(channel, entry, slab)).logits.argmax(1).numpy() != slab
+    policy, _ = head.outlook(held_out.wires(channel, entry, slab))
+    return policy.logits.argmax(1).numpy() != slab
 
 
 def probe(training: Float[Tensor, "e slab c"], held_out: Float[Tensor, "k slab c"]) -> float:
@@ -140,9 +141,6 @@ class EndToEnd(nn.Module):
     def outlook(self, wire: Float[Tensor, "b w"]):
         """The head's policy and value on the message."""
         return self.head.outlook(self.message(wire))
-
-    def policy(self, wire: Float[Tensor, "b w"]) -> torch.distributions.Categorical:
-        return self.outlook(wire)[0]
 
     def evaluate(self, observations: Float[Tensor, "b w"], actions: Int[Tensor, " b"]):
         """Log-probability, entropy and value, each (b,); their gradient reaches the sender."""

@@ -21,6 +21,7 @@ from lt_lib.perception.appearance import draw_appearances, eight_bits, recoloure
 from lt_lib.perception.encoder import LATENT, Encoder
 from lt_lib.perception.frames import hazard_visible, random_rollouts, wall_pixels
 from lt_lib.perception.gates import probes
+from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.objective import normalisation, optimise
 from lt_lib.perception.pictures import (
     PIXELS,
@@ -45,7 +46,9 @@ def frames_of(config: SenderConfig, seed: int) -> Pictures:
 
 def jepa(config: SenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
     """The paper's objective, with whatever weights its four terms have; untrained after 0 epochs."""
-    return fit_pictures(frames_of(config, seed), config, seed, Stream.SENDER.generator(seed), report)
+    if config.colour or config.texture:
+        return fit_pictures(frames_of(config, seed), config, seed, Stream.SENDER.generator(seed), report)
+    return train_encoder(config, seed, report=report)  # the paper's own training, which knows the few colours
 
 
 def principal_components(config: SenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
@@ -211,6 +214,7 @@ class Sender(NamedTuple):
     changes: Mapping[str, float] = MappingProxyType({})
 
 
+FEW = {"frames": 20_480}  # rollouts are drawn in blocks, so these are the first of all; enough to standardise by
 ALONE = {"variance": 0.0, "covariance": 0.0, "reconstruction": 0.0}
 SENDERS = {
     "jepa": Sender("JEPA latent (the paper's)", jepa),
@@ -219,10 +223,10 @@ SENDERS = {
     "contrastive": Sender("contrastive code (SimCLR)", contrastive),
     "autoencoder": Sender("autoencoder's code", autoencoder),
     "pca": Sender("64 principal components", principal_components),
-    "random": Sender("random projection", random_projection),
-    "untrained": Sender("untrained encoder", jepa, {"epochs": 0.0}),
+    "random": Sender("random projection", random_projection, FEW),
+    "untrained": Sender("untrained encoder", jepa, {"epochs": 0.0, **FEW}),
     "supervised": Sender("supervised on the hazard bit", supervised),
-    "silence": Sender("silence", silence),
+    "silence": Sender("silence", silence, FEW),
 }
 
 

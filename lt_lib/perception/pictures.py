@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
+from lt_lib.envs.camera import network_input
 from lt_lib.envs.layout import load_layout
 from lt_lib.perception.appearance import Appearances, draw_appearances, recoloured
 from lt_lib.perception.encoder import LATENT, Encoder, Frozen, in_chunks
@@ -51,10 +52,10 @@ class PictureEncoder(Frozen):
 
 
 class Pictures(NamedTuple):
-    """R rollouts of T frames, each rollout in an appearance of its own."""
+    """R rollouts of T frames, each rollout in an appearance of its own, or all in the simulation's."""
 
     rollouts: Rollouts
-    looks: Appearances
+    looks: Appearances | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -63,7 +64,8 @@ class Pictures(NamedTuple):
 
     def colours(self, r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b h w 3"]:
         """Colours in [0, 1] of frames t of rollouts r."""
-        return recoloured(self.rollouts.frames[r, t], self.looks.of(r))
+        frames = self.rollouts.frames[r, t]
+        return network_input(frames) if self.looks is None else recoloured(frames, self.looks.of(r))
 
     def sample(self, rng: np.random.Generator) -> Float[np.ndarray, "n h w 3"]:
         """SAMPLE frames of all."""
@@ -74,9 +76,10 @@ def draw_pictures(config: PictureConfig, rng: np.random.Generator) -> Pictures:
     """Random rollouts, and how each looks."""
     layout = load_layout(config.layout)
     rollouts = random_rollouts(layout, config.frames // config.rollout, config.rollout, rng)
-    return Pictures(
-        rollouts, draw_appearances(len(rollouts.frames), layout.camera.pixels, config.colour, config.texture, rng)
-    )
+    if not config.colour and not config.texture:
+        return Pictures(rollouts, None)
+    n, pixels = len(rollouts.frames), layout.camera.pixels
+    return Pictures(rollouts, draw_appearances(n, pixels, config.colour, config.texture, rng))
 
 
 def colour_codes(colours: Float[np.ndarray, "b h w 3"]) -> Int[np.ndarray, "b g g"]:

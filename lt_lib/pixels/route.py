@@ -5,7 +5,7 @@ one draw per episode is credited with the whole return; the head is never told w
 """
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -144,8 +144,19 @@ def train_head(
     return state_of(head, "head") | course | {f"greedy.{name}": values for name, values in greedy.items()}
 
 
+@runtime_checkable
+class Chooser(Protocol):
+    """What can learn to choose a route from a wire: a `RouteHead`, or an nn.Module with these methods of one."""
+
+    def outlook(self, wire: Tensor) -> tuple[torch.distributions.Categorical, Tensor]: ...
+
+    def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]: ...
+
+    def parameters(self): ...
+
+
 def learn(
-    head: RouteHead,
+    head: Chooser,
     optimiser: torch.optim.Optimizer,
     training: Bank,
     channel: Channel,
@@ -153,7 +164,7 @@ def learn(
     rng: np.random.Generator,
     report: Callable[[float], None],
 ) -> dict[str, np.ndarray]:
-    """Trains a head, or anything with its two methods, on a bank's draws; returns the course of the training.
+    """Trains a head on a bank's draws; returns the course of the training.
 
     "optimal", "success", "contacts", "length", "route" (episodes,);  "entropy", "value_loss" (updates,)
     """

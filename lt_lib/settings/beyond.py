@@ -94,8 +94,8 @@ class ControlsConfig(Settings):
 
     sender: SenderConfig = SenderConfig()
     gates: SenderGateConfig = SenderGateConfig()
-    colour: Share = 1.0  # of the second set of training frames: how random floor and walls are
-    texture: NonNegativeFloat = 0.1
+    recoloured: SenderConfig = SenderConfig(frames=102_400)  # the second training, on frames in random colours
+    colour: Share = 1.0  # of floor's and walls' colour that a random one replaces there
     drawn: PositiveInt = 3  # untrained encoders, and random projections
     repeats: PositiveInt = 2  # scenes per draw of the bank
     heads: PositiveInt = 5  # seeds

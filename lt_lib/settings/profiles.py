@@ -5,7 +5,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
@@ -141,6 +141,8 @@ def _inside(settings: Any, part: str | int) -> Any:
     """The type of a field of settings, or of the items of a list or dict of settings."""
     if hasattr(settings, "model_fields"):
         return settings.model_fields[part].annotation
+    if get_origin(settings) is Annotated:
+        return _inside(get_args(settings)[0], part)
     return next(kind for kind in reversed(get_args(settings)) if kind is not ...)
 
 
