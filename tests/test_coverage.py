@@ -7,8 +7,8 @@ from pydantic import ValidationError
 from scipy.stats import spearmanr
 
 from lt_lib.comm.channel import ANCHOR
-from lt_lib.envs.arena import NO_CORRIDOR, Arena
-from lt_lib.envs.layout import load_layout
+from lt_lib.envs.arena import Arena
+from lt_lib.envs.layout import NO_CORRIDOR, load_layout
 from lt_lib.perception.encoder import Encoder, FrozenEncoder, Predictor
 from lt_lib.pixels.episodes import draw_scenes
 from lt_lib.report.claims import load_claims

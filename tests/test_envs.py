@@ -16,10 +16,10 @@ from lt_lib.comm.messages import CONTENT
 from lt_lib.environments import gym
 from lt_lib.environments.gym import ArenaEnv, ArenaVectorEnv
 from lt_lib.environments.team import NAVIGATOR, SCOUT, TeamEnv
-from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena
+from lt_lib.envs.arena import HORIZON, Arena
 from lt_lib.envs.camera import FastCamera, colours
 from lt_lib.envs.geodesic import RouteDistance
-from lt_lib.envs.layout import load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, load_layout
 from lt_lib.pixels import episodes
 from lt_lib.settings.base import UserError
 

@@ -9,11 +9,11 @@ import torch
 import yaml
 from pydantic import ValidationError
 
-from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena, physics_xml
+from lt_lib.envs.arena import HORIZON, Arena, physics_xml
 from lt_lib.envs.camera import FastCamera, colours, network_input
 from lt_lib.envs.fidelity import agreement
 from lt_lib.envs.geodesic import MARGIN, RESOLUTION, RouteDistance
-from lt_lib.envs.layout import Layout, Robot, load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, Layout, Robot, load_layout
 from lt_lib.envs.materials import HAZARD, INDEX
 from lt_lib.envs.occlusion import occlusion, require_occlusion, sight_map
 from lt_lib.envs.reference import ReferenceCamera
@@ -343,7 +343,7 @@ BAD = {
     "number for an interval": ({"barrier": 1.2}, "barrier: "),
     "nothing in an interval": ({"barrier": [None, 1.2]}, "barrier.0: "),
     "no list": ({"corridors.left.legs": 3}, "corridors.left.legs: "),
-    "slabs of two sizes": ({"corridors.right.slab.x": [0.9, 1.8]}, "the slab must have the same size in both"),
+    "slabs of two sizes": ({"corridors.right.slab.x": [0.9, 1.8]}, "the slab must have the same size in all corridors"),
     "camera over the walls": ({"camera.height": 1.5}, "camera.height 1.5 m must be below"),
     "scout looks away": ({"scout.heading": 0.0}, "the scout cannot see the slab in the left corridor"),
     "scout sees one side": ({"scout.heading": 135.0}, "the scout cannot see the slab in the right corridor"),

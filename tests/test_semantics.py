@@ -11,9 +11,8 @@ from lt_lib import ppo
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.envs import measured
-from lt_lib.envs.arena import NO_CORRIDOR
 from lt_lib.envs.camera import FastCamera, network_input
-from lt_lib.envs.layout import load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, load_layout
 from lt_lib.gridworld.episodes import greedy, play
 from lt_lib.gridworld.map import Grid
 from lt_lib.gridworld.mappo import Actor, Inputs

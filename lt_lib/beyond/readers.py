@@ -42,7 +42,8 @@ def scenes_of(config: ReaderConfig, bank: Mapping[str, np.ndarray]) -> Scenes:
 def split(config: ReaderConfig, bank: Mapping[str, np.ndarray], scenes: Scenes, contents: Tensor) -> Split:
     """Banks of what is sent in each scene, of the bank's training draws and of its held-out ones."""
     outcomes = Outcomes(**{name: np.tile(bank[name], (config.repeats, 1, 1)) for name in Outcomes._fields})
-    whole = Bank(contents, scenes.scout[:, :2], scenes.spawn[:, :2], outcomes, bank["commit_step"])
+    blocks = load_layout(config.layout).blocks
+    whole = Bank(contents, scenes.scout[:, :2], scenes.spawn[:, :2], outcomes, blocks, bank["commit_step"])
     held_out = np.tile(np.arange(len(bank["spawn"])) < held_out_draws(bank), config.repeats)
     return Split(whole.take(~held_out), whole.take(held_out))
 
@@ -109,10 +110,10 @@ def greedy_choices(
 
     A head that always takes the same corridor, or that reads nothing, is right in one half.
     """
-    entry, slab = (axis.ravel() for axis in np.indices((len(held_out.contents), len(SIDES))))
+    entry, slab = (axis.ravel() for axis in np.indices(held_out.contents.shape[:2]))
     channel = channel_of(config, len(entry), held_out.contents.shape[-1], rng)
     policy, _ = head.outlook(held_out.wires(channel, entry, slab))
-    return policy.logits.argmax(1).numpy() != slab
+    return ~held_out.blocks[slab, policy.logits.argmax(1).numpy()]
 
 
 def probe(training: Float[Tensor, "e slab c"], held_out: Float[Tensor, "k slab c"]) -> float:

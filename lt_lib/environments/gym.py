@@ -18,9 +18,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float, UInt8
 
-from lt_lib.envs.arena import CONTROL_HZ, HORIZON, NO_CORRIDOR, Arena
+from lt_lib.envs.arena import CONTROL_HZ, HORIZON, Arena
 from lt_lib.envs.camera import FastCamera, colours
-from lt_lib.envs.layout import SIDES, Layout, load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, SIDES, Layout, load_layout
 from lt_lib.envs.reference import TopView
 from lt_lib.settings.base import UserError
 

@@ -19,7 +19,6 @@ V_MAX = 0.5  # m/s
 W_MAX = 1.5  # rad/s
 HORIZON = 600  # control steps
 CONTACT = 0.005  # metres; anything nearer counts as touching
-NO_CORRIDOR = -1
 
 MASS, GAIN, FORCE = (
     1.0,
@@ -32,11 +31,11 @@ class Arena:
     """n independent scenes, each with one navigator. The attributes describe the state after the latest step:
 
     pose      (n, 3) x, y, heading of the navigators: metres, metres, radians
-    slab      (n,) blocked corridor, 0 left, 1 right
+    slab      (n,) placement of the slabs; with two corridors, the blocked one, 0 left, 1 right
     scout     (n, 3) the scouts' poses
     contact   (n,) whether the navigator touches the slab
     reached   (n,) whether the navigator is at the goal
-    corridor  (n,) the corridor that the navigator stands in: 0 left, 1 right, -1 none
+    corridor  (n,) the corridor that the navigator stands in: 0 left, 1 right, NO_CORRIDOR none
     """
 
     def __init__(self, layout: Layout, n: int):
@@ -47,7 +46,8 @@ class Arena:
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._mocap = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
         self._warm = self._batch.bind("qacc_warmstart")
-        self._slab_centre = np.array([layout.slab(side).centre for side in (0, 1)])
+        centres = [[layout.slab(side).centre for side in blocked] for blocked in layout.placements]
+        self._slab_centres = np.array(centres)  # (placements, slabs, 2)
         self.slab = np.zeros(n, np.int64)
         self.scout = np.tile(layout.scout.array, (n, 1))
 
@@ -71,11 +71,11 @@ class Arena:
         slab: Int[np.ndarray, " n"],
         scout: Float[np.ndarray, "n 3"],
     ):
-        """Starts new episodes in the scenes of `which`; the slab blocks the left (0) or the right (1) corridor."""
+        """Starts new episodes in the scenes of `which`, with the slabs placed as `slab` says."""
         self._qpos[which], self._qvel[which], self._warm[which] = pose[which], 0.0, 0.0
         self.slab[which], self.scout[which] = slab[which], scout[which]
-        self._mocap[which, 0, :2] = self._slab_centre[slab[which]]
-        self._mocap[which, 1, :2] = scout[which, :2]
+        self._mocap[which, :-1, :2] = self._slab_centres[slab[which]]
+        self._mocap[which, -1, :2] = scout[which, :2]
         self._observe()
 
     def step(self, action: Float[np.ndarray, "n 3"], live: Bool[np.ndarray, " n"] | None = None):
@@ -108,10 +108,9 @@ class Arena:
 
     def _observe(self):
         x, y = self._qpos[:, 0], self._qpos[:, 1]
-        left, right = self.layout.routes
         self.contact = self.layout.slab_distance(self.slab, x, y) < self.layout.robot.radius + CONTACT
         self.reached = np.hypot(x - self.layout.goal.x, y - self.layout.goal.y) < self.layout.goal.radius
-        self.corridor = np.where(left.contains(x, y), 0, np.where(right.contains(x, y), 1, NO_CORRIDOR))
+        self.corridor = self.layout.corridor_at(x, y)
 
 
 def physics_xml(layout: Layout) -> str:
@@ -119,7 +118,8 @@ def physics_xml(layout: Layout) -> str:
     walls = "".join(solid(wall) for wall in layout.walls)
     slab = layout.slab(0)
     (cx, cy), (x0, x1, y0, y1) = slab.centre, slab.bounds
-    centred = Box((x0 - cx, x1 - cx, y0 - cy, y1 - cy), layout.wall_height, "slab")
+    centred = solid(Box((x0 - cx, x1 - cx, y0 - cy, y1 - cy), layout.wall_height, "slab"))
+    slabs = "".join(f'<body name="slab {i}" mocap="true">{centred}</body>' for i in range(len(layout.placements[0])))
     radius, friction = layout.robot.radius, layout.robot.friction
     # sliding friction along the contact plane; torsion and rolling would brake a sphere that stands for a disc
     return f"""
@@ -128,7 +128,7 @@ def physics_xml(layout: Layout) -> str:
   <default><geom condim="3" friction="{friction} 0 0" contype="1" conaffinity="2"/></default>
   <worldbody>
     {walls}
-    <body name="slab" mocap="true">{solid(centred)}</body>
+    {slabs}
     <body name="scout" mocap="true" pos="0 0 {radius}"><geom type="sphere" size="{radius}"/></body>
     <body name="navigator" pos="0 0 {radius}">
       <joint name="x" type="slide" axis="1 0 0"/>

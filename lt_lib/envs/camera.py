@@ -8,7 +8,7 @@ MuJoCo's own renderer behind the same call.
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lt_lib.envs.layout import SIDES, Layout
+from lt_lib.envs.layout import Layout
 from lt_lib.envs.materials import GOAL_PILLAR, INDEX, PALETTE
 from lt_lib.envs.raycast import draw, expand
 
@@ -23,7 +23,8 @@ class FastCamera:
         self._walls = np.array([wall.bounds for wall in layout.walls], np.float32)  # (W, 4) x0, x1, y0, y1
         self._wall_index = np.array([INDEX[f"{wall.material}_x"] for wall in layout.walls], np.uint8)  # (W,)
         self._wall_height = np.float32(layout.wall_height)
-        self._slabs = np.array([layout.slab(side).bounds for side in range(len(SIDES))], np.float32)  # (2, 4)
+        boxes = [[layout.slab(side).bounds for side in blocked] for blocked in layout.placements]
+        self._slabs = np.array(boxes, np.float32)  # (placements, slabs, 4)
         self._slab_height = np.float32(layout.slab_height)
         self._goal = np.array([layout.goal.x, layout.goal.y, *GOAL_PILLAR], np.float32)  # (4,) x, y, radius, height
         self._robot = np.array([layout.robot.radius, layout.robot.height], np.float32)  # (2,)
@@ -34,7 +35,7 @@ class FastCamera:
         """Palette indices (B, H, W) of what each camera sees.
 
         eyes    (B, 3) the camera's pose: metres, metres, radians
-        slabs   (B,) the blocked corridor: 0 left, 1 right
+        slabs   (B,) the placement of the slabs; with two corridors, the blocked one: 0 left, 1 right
         others  (B, 2) the other robot's position, metres
         """
         out = np.empty((len(eyes), self.pixels, self.pixels), np.uint8)

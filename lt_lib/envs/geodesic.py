@@ -6,7 +6,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from lt_lib.envs.layout import SIDES, Layout
+from lt_lib.envs.layout import NO_CORRIDOR, Layout
 from lt_lib.settings.base import UserError
 
 RESOLUTION = 0.05  # metres
@@ -14,14 +14,14 @@ MARGIN = 0.02  # metres; extra clearance from every wall
 
 
 class RouteDistance:
-    """Distance in metres from points (n, 2) to the goal through the left (0) or the right (1) corridor.
+    """Distance in metres from points (n, 2) to the goal through one corridor; of two, the left (0) or the right (1).
 
-    Raises UserError if the spawn cannot reach the goal through either of them.
+    Raises UserError if the spawn cannot reach the goal through one of them.
     """
 
     def __init__(self, layout: Layout):
         self._origin = np.array([layout.arena.x[0], layout.arena.y[0]])
-        self._maps = np.stack([_distance_map(layout, side) for side in range(len(SIDES))])  # (2, X, Y)
+        self._maps = np.stack([_distance_map(layout, side) for side in range(len(layout.routes))])  # (C, X, Y)
 
     def __call__(self, position: Float[np.ndarray, "n 2"], route) -> Float[np.ndarray, " n"]:
         cells = (position - self._origin) / RESOLUTION  # (n, 2)
@@ -33,15 +33,15 @@ def _distance_map(layout: Layout, side: int) -> Float[np.ndarray, "x y"]:
     ys = np.arange(layout.arena.y[0], layout.arena.y[1] + RESOLUTION / 2, RESOLUTION)
     x, y = np.meshgrid(xs, ys, indexing="ij")  # (X, Y)
     radius = layout.robot.radius
-    free = layout.free(x, y, radius + MARGIN) & ~layout.routes[1 - side].contains(x, y)  # (X, Y)
+    free = layout.free(x, y, radius + MARGIN) & np.isin(layout.corridor_at(x, y), (side, NO_CORRIDOR))  # (X, Y)
     free &= np.hypot(x - layout.scout.x, y - layout.scout.y) > 2 * radius + 2 * MARGIN
     goal = (np.abs(xs - layout.goal.x).argmin(), np.abs(ys - layout.goal.y).argmin())
     distance = dijkstra(_grid_graph(free), indices=np.ravel_multi_index(goal, free.shape)).reshape(free.shape)
     spawn = (np.abs(xs - layout.spawn.x).argmin(), np.abs(ys - layout.spawn.y).argmin())
     if not np.isfinite(distance[spawn]):
         raise UserError(
-            f"layout {layout.name}: the goal cannot be reached from the spawn through the {SIDES[side]} corridor; "
-            "join the corridor's legs and keep the scout out of the way"
+            f"layout {layout.name}: the goal cannot be reached from the spawn through the {layout.sides[side]} "
+            "corridor; join the corridor's legs and keep the scout out of the way"
         )
     gap, nearest = distance_transform_edt(~np.isfinite(distance), sampling=RESOLUTION, return_indices=True)
     return distance[tuple(nearest)] + gap

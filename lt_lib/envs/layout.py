@@ -2,15 +2,17 @@
 
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import (
     AfterValidator,
+    Discriminator,
     Field,
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
+    Tag,
     ValidationError,
     model_validator,
 )
@@ -19,7 +21,8 @@ from lt_lib.settings.base import Settings, UserError, layout_path
 from lt_lib.settings.strict_yaml import read_yaml
 
 LEFT, RIGHT = 0, 1
-SIDES = ("left", "right")
+SIDES = ("left", "right")  # of the paper's two corridors
+NO_CORRIDOR = -1
 OUTER_THICKNESS = 0.1  # metres
 
 
@@ -64,6 +67,8 @@ class Corridor(Settings):
 
 
 class Corridors(Settings):
+    """The paper's two."""
+
     left: Corridor
     right: Corridor
 
@@ -135,7 +140,12 @@ class Layout(Settings):
     arena: Rect
     wall_height: PositiveFloat
     barrier: Interval
-    corridors: Corridors
+    corridors: Annotated[
+        Annotated[Corridors, Tag("pair")]
+        | Annotated[Annotated[tuple[Corridor, ...], Field(min_length=2)], Tag("several")],
+        Discriminator(lambda value: "several" if isinstance(value, list | tuple) else "pair"),
+    ]
+    blocked: Literal["one", "all but one"] = "one"  # corridors at a time
     slab_height: PositiveFloat
     robot: Robot
     camera: Camera
@@ -146,8 +156,27 @@ class Layout(Settings):
     communication_radius: PositiveFloat
 
     @property
-    def routes(self) -> tuple[Corridor, Corridor]:
-        return self.corridors.left, self.corridors.right
+    def routes(self) -> tuple[Corridor, ...]:
+        pair = isinstance(self.corridors, Corridors)
+        return (self.corridors.left, self.corridors.right) if pair else self.corridors
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """What the corridors are called."""
+        return SIDES if len(self.routes) == len(SIDES) else tuple(str(i + 1) for i in range(len(self.routes)))
+
+    @cached_property
+    def placements(self) -> tuple[tuple[int, ...], ...]:
+        """The corridors blocked under each placement of the slabs; with two corridors, placement 0 blocks the left."""
+        corridors = range(len(self.routes))
+        if self.blocked == "one":
+            return tuple((i,) for i in corridors)
+        return tuple(tuple(other for other in corridors if other != i) for i in corridors)
+
+    @cached_property
+    def blocks(self) -> np.ndarray:
+        """Whether each placement blocks each corridor, (placements, corridors)."""
+        return np.array([[i in blocked for i in range(len(self.routes))] for blocked in self.placements])
 
     @cached_property
     def walls(self) -> tuple[Box, ...]:
@@ -176,13 +205,19 @@ class Layout(Settings):
         return sorted(done)
 
     def slab(self, side: int) -> Box:
-        """The hazard slab in the left (0) or right (1) corridor."""
+        """The hazard slab in a corridor, with two of them the left (0) or right (1)."""
         return Box(self.routes[side].slab.bounds, self.slab_height, "slab")
 
-    def slab_distance(self, side, x, y):
-        """Distance in metres from points to the slab in the left (0) or right (1) corridor; broadcasts."""
-        left, right = (route.slab.distance(x, y) for route in self.routes)
-        return np.where(side == 0, left, right)
+    def slab_distance(self, slab, x, y):
+        """Distance in metres from points to the nearest slab of a placement; broadcasts."""
+        each = [route.slab.distance(x, y) for route in self.routes]
+        nearest = [np.minimum.reduce([each[i] for i in blocked]) for blocked in self.placements]
+        return np.select([slab == i for i in range(len(nearest))], nearest)
+
+    def corridor_at(self, x, y):
+        """The corridor that each point lies in, or NO_CORRIDOR; broadcasts."""
+        inside = [route.contains(x, y) for route in self.routes]
+        return np.select(inside, range(len(inside)), NO_CORRIDOR)
 
     def free(self, x, y, clearance: float = 0.0):
         """Whether a disc of radius `clearance` (metres) centred on the points touches no wall; broadcasts."""
@@ -195,13 +230,13 @@ class Layout(Settings):
             raise ValueError(f"slab_height {self.slab_height} m must not exceed wall_height {self.wall_height} m")
         if not self.camera.height < self.wall_height:
             raise ValueError(f"camera.height {self.camera.height} m must be below wall_height {self.wall_height} m")
-        for side, corridor in zip(SIDES, self.routes, strict=True):
+        for side, corridor in zip(self.sides, self.routes, strict=True):
             self._check_corridor(side, corridor)
         sizes = [(round(c.slab.x[1] - c.slab.x[0], 6), round(c.slab.y[1] - c.slab.y[0], 6)) for c in self.routes]
-        if sizes[0] != sizes[1]:  # one solid body moves between the corridors
-            raise ValueError(
-                f"the slab must have the same size in both corridors, got {sizes[0]} m left, {sizes[1]} m right"
-            )
+        for side, size in zip(self.sides, sizes, strict=True):
+            if size != sizes[0]:  # solid bodies move between the corridors
+                both = f"{sizes[0]} m {self.sides[0]}, {size} m {side}"
+                raise ValueError(f"the slab must have the same size in all corridors, got {both}")
         for name in ("spawn", "scout", "goal"):
             self._check_standing(name, getattr(self, name))
         for i, point in enumerate(self.choice_points):
@@ -250,7 +285,7 @@ def load_layout(name: str) -> Layout:
         return Layout(**content)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
+        where = ".".join(str(part) for part in first["loc"] if part not in ("pair", "several"))
         raise UserError(
             f"layout {path.name}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}"
         ) from error

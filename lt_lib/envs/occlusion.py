@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lt_lib.envs.camera import FastCamera
-from lt_lib.envs.layout import SIDES, Layout, Pose
+from lt_lib.envs.layout import Layout, Pose
 from lt_lib.envs.materials import HAZARD
 from lt_lib.settings.base import UserError
 
@@ -19,10 +19,10 @@ HEADINGS = np.arange(8) * np.pi / 4  # radians; neighbouring views overlap if th
 
 
 class Occlusion(NamedTuple):
-    """Hazard pixels per frame. The last axis is the placement of the slab: 0 left, 1 right."""
+    """Hazard pixels per frame. The last axis is the corridor that a slab stands in."""
 
-    navigator: Int[np.ndarray, "points 2"]
-    scout: Int[np.ndarray, "2"]
+    navigator: Int[np.ndarray, "points c"]
+    scout: Int[np.ndarray, " c"]
 
 
 class SightMap(NamedTuple):
@@ -42,20 +42,25 @@ def hazard_pixels(
 
 
 def occlusion(layout: Layout, camera) -> Occlusion:
-    """The paper's check: the navigator at every choice point and the scout at its post, under both placements."""
-    navigator = [under_both(camera, point, layout.scout) for point in layout.choice_points]
-    return Occlusion(np.stack(navigator), under_both(camera, layout.scout, layout.spawn))
+    """The paper's check: the navigator at every choice point and the scout at its post, one corridor blocked at a time.
+
+    camera  draws the layout, or one that differs in nothing but how many corridors are blocked, with one
+    """
+    n = len(layout.routes)
+    navigator = [under_each(camera, point, layout.scout, n) for point in layout.choice_points]
+    return Occlusion(np.stack(navigator), under_each(camera, layout.scout, layout.spawn, n))
 
 
-def under_both(camera, eye: Pose, other: Pose) -> Int[np.ndarray, "2"]:
-    """Hazard pixels from one pose, with the slab left and right; the other robot stands at `other`."""
-    return hazard_pixels(camera, np.tile(eye.array, (2, 1)), np.arange(2), np.tile(other.array[:2], (2, 1)))
+def under_each(camera, eye: Pose, other: Pose, placements: int) -> Int[np.ndarray, " c"]:
+    """Hazard pixels from one pose under every placement of the slabs; the other robot stands at `other`."""
+    eyes, others = (np.tile(each, (placements, 1)) for each in (eye.array, other.array[:2]))
+    return hazard_pixels(camera, eyes, np.arange(placements), others)
 
 
 def require_occlusion(layout: Layout) -> None:
     """Raises a one-line UserError if the navigator can see the slab from a choice point or the scout cannot see it."""
-    seen = occlusion(layout, FastCamera(layout, PIXELS))
-    for slab, side in enumerate(SIDES):
+    seen = occlusion(layout, FastCamera(layout.model_copy(update={"blocked": "one"}), PIXELS))
+    for slab, side in enumerate(layout.sides):
         for i, pixels in enumerate(seen.navigator[:, slab]):
             if pixels:
                 raise UserError(

@@ -95,24 +95,28 @@ def _paint_walls(frame, top, bottom, colour):
 
 @compiled()
 def _paint_objects(frame, enter, leave, axis, nearest, rise, eye, inverse):
-    """Paints slab, goal pillar and robot over the walls, the farthest first in every column.
+    """Paints slabs, goal pillar and robot over the walls, the farthest first in every column.
 
-    enter, leave  (3, P) depths of slab, pillar and robot
-    rise          (3,) heights of their tops above the eye
+    enter, leave  (n, P) depths of n - 2 slabs, the pillar and the robot
+    axis          (n - 2, P) of the slabs' faces
+    rise          (n,) heights of their tops above the eye
     """
-    size = np.float32(frame.shape[0])
+    size, n = np.float32(frame.shape[0]), enter.shape[0]
+    pillar = n - 2
     for c in range(frame.shape[1]):
-        while min(enter[0, c], enter[1, c], enter[2, c]) < nearest[c]:
-            far = np.float32(-1)  # the farthest object in front of the wall, and its number k
-            for j in range(3):
+        while True:
+            far, k = np.float32(-1), -1  # the farthest object in front of the wall, and its number
+            for j in range(n):
                 if far < enter[j, c] < nearest[c]:
                     far, k = enter[j, c], j
+            if k < 0:
+                break
             enter[k, c] = _FAR  # painted
-            front = _SLAB + axis[c] if k == 0 else (_GOAL if k == 1 else _ROBOT)
+            front = _SLAB + axis[k, c] if k < pillar else (_GOAL if k == pillar else _ROBOT)
             edge = _row(rise[k] / far, inverse, size)
             frame[edge : _row(-eye / far, inverse, size), c] = front
             if rise[k] < 0:  # the top is visible from above
-                frame[_row(rise[k] / leave[k, c], inverse, size) : edge, c] = _SLAB_TOP if k == 0 else front
+                frame[_row(rise[k] / leave[k, c], inverse, size) : edge, c] = _SLAB_TOP if k < pillar else front
 
 
 @compiled()
@@ -120,7 +124,7 @@ def draw(eyes, slabs, others, eye, tan, walls, wall_index, wall_height, slab_box
     """Draws B frames into out (B, P, P), as palette indices; lengths in metres, angles in radians.
 
     eyes (B, 3), slabs (B,), others (B, 2): as in `FastCamera.frames`
-    walls (W, 4), slab_boxes (2, 4): footprints (x0, x1, y0, y1)
+    walls (W, 4), slab_boxes (placements, slabs, 4): footprints (x0, x1, y0, y1)
     wall_index (W,): palette index of each wall's x faces; its y faces follow it
     goal (4,): x, y, radius, height;  robot (2,): radius, height;  tan: of half the field of view
     """
@@ -133,9 +137,11 @@ def draw(eyes, slabs, others, eye, tan, walls, wall_index, wall_height, slab_box
     dx, dy, nearest = np.empty(pixels, np.float32), np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     ix, iy = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     top, bottom = np.empty(pixels, np.int16), np.empty(pixels, np.int16)
-    colour, axis = np.empty(pixels, np.uint8), np.empty(pixels, np.uint8)
-    enter, leave = np.empty((3, pixels), np.float32), np.empty((3, pixels), np.float32)
-    rise = np.array([slab_height - eye, goal[3] - eye, robot[1] - eye], np.float32)  # (3,)
+    boxes = slab_boxes.shape[1]
+    colour, axis = np.empty(pixels, np.uint8), np.empty((boxes, pixels), np.uint8)
+    enter, leave = np.empty((boxes + 2, pixels), np.float32), np.empty((boxes + 2, pixels), np.float32)
+    rise = np.full(boxes + 2, slab_height - eye, np.float32)  # (boxes + 2,)
+    rise[boxes], rise[boxes + 1] = goal[3] - eye, robot[1] - eye
     for i in range(eyes.shape[0]):
         ox, oy = np.float32(eyes[i, 0]), np.float32(eyes[i, 1])
         cos, sin = np.float32(np.cos(eyes[i, 2])), np.float32(np.sin(eyes[i, 2]))
@@ -147,7 +153,8 @@ def draw(eyes, slabs, others, eye, tan, walls, wall_index, wall_height, slab_box
             top[c] = _row((wall_height - eye) / nearest[c], inverse, size)
             bottom[c] = _row(-eye / nearest[c], inverse, size)
         _paint_walls(out[i], top, bottom, colour)
-        _meet_box(ox, oy, ix, iy, slab_boxes[slabs[i]], enter[0], leave[0], axis)
-        _meet_disc(ox, oy, dx, dy, goal[0], goal[1], goal[2], enter[1], leave[1])
-        _meet_disc(ox, oy, dx, dy, others[i, 0], others[i, 1], robot[0], enter[2], leave[2])
+        for k in range(boxes):
+            _meet_box(ox, oy, ix, iy, slab_boxes[slabs[i], k], enter[k], leave[k], axis[k])
+        _meet_disc(ox, oy, dx, dy, goal[0], goal[1], goal[2], enter[boxes], leave[boxes])
+        _meet_disc(ox, oy, dx, dy, others[i, 0], others[i, 1], robot[0], enter[boxes + 1], leave[boxes + 1])
         _paint_objects(out[i], enter, leave, axis, nearest, rise, eye, inverse)

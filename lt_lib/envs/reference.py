@@ -82,11 +82,12 @@ class TopView:
 
 
 def place(layout: Layout, model, data, eye, slab: int, other):
-    """Places the navigator (3,), the slab (0 left, 1 right) and the other robot (2,) in an MjData."""
+    """Places the navigator (3,), the slabs (with two corridors 0 left, 1 right), the other robot (2,) in an MjData."""
     height = layout.camera.height
     data.mocap_pos[model.body("navigator").mocapid[0]] = (eye[0], eye[1], height)
     data.mocap_quat[model.body("navigator").mocapid[0]] = (np.cos(eye[2] / 2), 0, 0, np.sin(eye[2] / 2))
-    data.mocap_pos[model.body("slab").mocapid[0]] = (*layout.slab(slab).centre, 0)
+    for i, side in enumerate(layout.placements[slab]):
+        data.mocap_pos[model.body(f"slab {i}").mocapid[0]] = (*layout.slab(side).centre, 0)
     data.mocap_pos[model.body("scout").mocapid[0]] = (other[0], other[1], 0)
     mujoco.mj_forward(model, data)
 
@@ -99,6 +100,14 @@ def scene_xml(layout: Layout, pixels: int) -> str:
     slab = layout.slab(0)
     sx, sy = slab.bounds[1] - slab.bounds[0], slab.bounds[3] - slab.bounds[2]
     centred = Box((-sx / 2, sx / 2, -sy / 2, sy / 2), slab.height, "slab")
+    slabs = "".join(
+        f'''
+    <body name="slab {i}" mocap="true">{_faces(f"slab {i}", centred)}
+      <geom name="slab_z:{i}" type="box" pos="0 0 {slab.height - FACE / 2}"
+            size="{sx / 2} {sy / 2} {FACE / 2}" {_rgba("slab_z")}/>
+    </body>'''
+        for i in range(len(layout.placements[0]))
+    )
     return f"""
 <mujoco>
   <statistic extent="1" center="0 0 0"/>
@@ -118,10 +127,7 @@ def scene_xml(layout: Layout, pixels: int) -> str:
           size="{GOAL_PILLAR[0]} {GOAL_PILLAR[1] / 2}" {_rgba("goal")}/>
     <geom name="pad" type="cylinder" pos="{layout.goal.x} {layout.goal.y} 0.01" group="{FROM_ABOVE}"
           size="{layout.goal.radius} 0.01" rgba="0.5 0.8 0.5 1"/>
-    <body name="slab" mocap="true">{_faces("slab", centred)}
-      <geom name="slab_z:0" type="box" pos="0 0 {slab.height - FACE / 2}"
-            size="{sx / 2} {sy / 2} {FACE / 2}" {_rgba("slab_z")}/>
-    </body>
+    {slabs}
     <body name="scout" mocap="true">{_robot(layout, "robot:0", SCOUT, "robot")}</body>
     <body name="navigator" mocap="true" pos="0 0 {camera.height}">
       <camera name="eye" fovy="{camera.fov}" xyaxes="0 -1 0 0 0 1"/>

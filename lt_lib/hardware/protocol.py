@@ -18,7 +18,7 @@ from lt_lib.perception.frames import random_rollouts
 from lt_lib.perception.gates import encode
 from lt_lib.perception.pictures import PictureEncoder
 from lt_lib.pixels.episodes import obedience, roll_bank
-from lt_lib.pixels.executor import ROUTES, FrozenExecutor, train_executor
+from lt_lib.pixels.executor import FrozenExecutor, train_executor
 from lt_lib.settings.base import ROOT, UserError, everywhere
 from lt_lib.settings.devices import computing_device
 from lt_lib.settings.hardware import (
@@ -177,5 +177,5 @@ def past_the_rails(config: RailsConfig, encoder: Result, executor: Result) -> Fl
     rollouts = random_rollouts(load_layout(config.layout), config.rollouts, config.length, rng)
     latents = torch.from_numpy(encode(FrozenEncoder(encoder, device), rollouts.frames)).flatten(0, 1).to(device)
     driver = FrozenExecutor(executor, device)
-    actions = [driver.mean_action(latents, np.full(len(latents), route)) for route in range(ROUTES)]
+    actions = [driver.mean_action(latents, np.full(len(latents), route)) for route in range(driver.routes)]
     return (np.abs(actions) > 1).mean(axis=1)

@@ -17,7 +17,7 @@ ARENAS = 640  # rollouts stepped side by side
 class Rollouts(NamedTuple):
     """R rollouts of T steps: frames of palette indices, actions in [-1, 1], poses in metres, metres, radians.
 
-    `slab` is the blocked corridor, 0 left, 1 right; no self-supervised training looks at it.
+    `slab` is the placement of the slabs; no self-supervised training looks at it.
     """
 
     frames: UInt8[np.ndarray, "r t h w"]
@@ -34,7 +34,7 @@ def random_rollouts(layout: Layout, rollouts: int, length: int, rng: np.random.G
 
 def _rollouts(layout: Layout, n: int, length: int, rng: np.random.Generator) -> Rollouts:
     arena, camera = Arena(layout, n), FastCamera(layout)
-    slab = rng.integers(0, 2, n)
+    slab = rng.integers(0, len(layout.placements), n)
     other = free_poses(layout, slab, rng)
     pose = free_poses(layout, slab, rng, apart_from=other)
     arena.reset(np.ones(n, bool), pose, slab, other)
@@ -52,9 +52,9 @@ def _rollouts(layout: Layout, n: int, length: int, rng: np.random.Generator) -> 
 def free_poses(
     layout: Layout, slab: Int[np.ndarray, " n"], rng: np.random.Generator, apart_from=None
 ) -> Float[np.ndarray, "n 3"]:
-    """Uniform poses over the free arena, clear of walls, of the slab and of the robots at `apart_from`.
+    """Uniform poses over the free arena, clear of walls, of the slabs and of the robots at `apart_from`.
 
-    slab        (n,) 0 left, 1 right
+    slab        (n,) the placement of the slabs
     apart_from  (n, 2) or (n, 3) metres, or None
     """
     n, radius = len(slab), layout.robot.radius

@@ -10,15 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lt_lib.envs.arena import HORIZON, NO_CORRIDOR, Arena
+from lt_lib.envs.arena import HORIZON, Arena
 from lt_lib.envs.camera import FastCamera
-from lt_lib.envs.layout import Layout, load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, Layout, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
-from lt_lib.pixels.executor import ROUTES, FrozenExecutor
+from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.settings.pixels import BankConfig
 from lt_lib.settings.streams import Stream
 
-SLABS = 2
 ARRIVAL_REWARD = 1.0
 CONTACT_REWARD = -0.01  # per control step in contact with the slab
 
@@ -61,7 +60,7 @@ def drive(
 ) -> Outcomes:
     """Drives E episodes, `envs` at a time, each from its draw to the goal or the time-out.
 
-    slab, route  (E,) 0 left, 1 right: the blocked corridor and the commanded one
+    slab, route  (E,) the placement of the slabs and the commanded corridor; with two of them, 0 left, 1 right
     commit_step  the navigator waits until this step, since no message can have told it where to go
 
     A batch always has `envs` rows, so that an episode's arithmetic does not depend on what runs beside it.
@@ -139,7 +138,7 @@ def roll_bank(
     """
     layout, device = load_layout(config.layout), config.device
     draws = draw_scenes(layout, config.entries, Stream.BANK.generator(seed))
-    shape = (config.entries, SLABS, ROUTES)
+    shape = (config.entries, len(layout.placements), len(layout.routes))
     entry, slab, route = (axis.ravel() for axis in np.indices(shape))
     outcome = drive(
         layout,
@@ -158,4 +157,4 @@ def roll_bank(
 
 def obedience(bank: Mapping[str, Any]) -> float:
     """Share of a bank's episodes in which the executor entered the commanded corridor."""
-    return float((bank["entered"] == np.arange(ROUTES)).mean())
+    return float((bank["entered"] == np.arange(bank["entered"].shape[-1])).mean())

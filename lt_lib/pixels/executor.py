@@ -13,17 +13,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lt_lib import ppo
-from lt_lib.envs.arena import NO_CORRIDOR, Arena
+from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.geodesic import RouteDistance
-from lt_lib.envs.layout import Layout, load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 from lt_lib.settings.pixels import ExecutorConfig
 from lt_lib.settings.streams import Stream
 from lt_lib.store.states import state_of
 
-ROUTES = 2
 FROM_SPAWN = 0.5  # share of pretraining episodes that start at the spawn
 TIME_LIMIT = 300  # control steps of a pretraining episode; a time-out is bootstrapped, not punished
 ENTERED, DISOBEYED, ARRIVED, BLOCKED = (
@@ -37,9 +36,9 @@ ENTERED, DISOBEYED, ARRIVED, BLOCKED = (
 class Executor(nn.Module):
     """Gaussian policy over body-frame velocities, and a value function; 128-128 tanh each."""
 
-    def __init__(self):
+    def __init__(self, routes: int = 2):
         super().__init__()
-        self.mean, self.critic = ppo.mlp(LATENT + ROUTES, ACTION, 0.01), ppo.mlp(LATENT + ROUTES, 1, 1.0)
+        self.mean, self.critic = ppo.mlp(LATENT + routes, ACTION, 0.01), ppo.mlp(LATENT + routes, 1, 1.0)
         self.log_std = nn.Parameter(torch.full((ACTION,), -0.5))
 
     def evaluate(self, observations: Float[Tensor, "b d"], actions: Float[Tensor, "b 3"]):
@@ -51,18 +50,19 @@ class FrozenExecutor:
     """The pretrained controller: the policy's mean, no exploration, no gradient."""
 
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu"):
-        self._policy = Executor().to(device).requires_grad_(False)
+        self.routes = weights["mean.0.weight"].shape[1] - LATENT
+        self._policy = Executor(self.routes).to(device).requires_grad_(False)
         self._policy.load_state_dict({name: torch.tensor(weights[name]) for name in self._policy.state_dict()})
 
     @torch.inference_mode()
     def mean_action(self, latent: Float[Tensor, "b 64"], route) -> Float[np.ndarray, "b 3"]:
-        """Body-frame velocities before clipping, for a commanded route (B,) 0 left, 1 right."""
-        return self._policy.mean(with_route(latent, route)).cpu().numpy()
+        """Body-frame velocities before clipping, for a commanded route (B,); of two, 0 is left, 1 right."""
+        return self._policy.mean(with_route(latent, route, self.routes)).cpu().numpy()
 
 
-def with_route(latent: Float[Tensor, "b 64"], route) -> Float[Tensor, "b 66"]:
-    """The executor's observation: its own latent and the one-hot route."""
-    one_hot = F.one_hot(torch.as_tensor(route, device=latent.device), ROUTES)
+def with_route(latent: Float[Tensor, "b 64"], route, routes: int) -> Float[Tensor, "b d"]:
+    """The executor's observation: its own latent and the one-hot route of so many."""
+    one_hot = F.one_hot(torch.as_tensor(route, device=latent.device), routes)
     return torch.cat([latent, one_hot.to(latent.dtype)], dim=1)
 
 
@@ -83,7 +83,7 @@ class Driving:
         """The observations of some rows, all by default."""
         arena, rows = self._arena, np.arange(len(self.route)) if rows is None else rows
         frames = self._camera.frames(arena.pose[rows], arena.slab[rows], arena.scout[rows, :2])
-        return with_route(self._encoder.latent(frames), self.route[rows])
+        return with_route(self._encoder.latent(frames), self.route[rows], len(self._layout.routes))
 
     def step(self, action):
         """One control step; returns rewards, obedient, terminated, ended and the observation before any reset."""
@@ -94,7 +94,7 @@ class Driving:
         inside = corridor == self.route
         wrong = (corridor != NO_CORRIDOR) & ~inside
         arrived = self._arena.reached
-        blocked = self._arena.contact & (self._arena.slab == self.route)
+        blocked = self._arena.contact & self._layout.blocks[self._arena.slab, self.route]
         terminated = wrong | arrived | blocked
         first = inside & ~self._entered
         self._entered |= inside
@@ -114,11 +114,12 @@ class Driving:
     def _restart(self, which):
         """New episodes: half from the spawn, half from anywhere outside the corridor that was not commanded."""
         n, rng, layout = len(which), self._rng, self._layout
-        slab, route, scout = rng.integers(0, 2, n), rng.integers(0, ROUTES, n), layout.scout.sample(n, rng)
+        slab, route = rng.integers(0, len(layout.placements), n), rng.integers(0, len(layout.routes), n)
+        scout = layout.scout.sample(n, rng)
         anywhere = free_poses(layout, slab, rng, apart_from=scout)
         anywhere[:, 2] /= 2  # looking ahead, within +- 90 degrees
-        left, right = layout.routes
-        wrong = np.where(route == 0, right.contains(*anywhere.T[:2]), left.contains(*anywhere.T[:2]))
+        there = layout.corridor_at(*anywhere.T[:2])
+        wrong = (there != NO_CORRIDOR) & (there != route)
         start = np.where(((rng.random(n) < FROM_SPAWN) | wrong)[:, None], layout.spawn.sample(n, rng), anywhere)
         self._arena.reset(which, start, slab, scout)
         self.route = np.where(which, route, self.route)
@@ -134,13 +135,13 @@ def train_executor(
     "curve.*" have one entry per update: obedient share of the episodes that ended, their number, entropy.
     "<look>.*" are the weights after each of `config.looks`.
     """
-    rng = Stream.EXECUTOR.generator(seed)
+    rng, layout = Stream.EXECUTOR.generator(seed), load_layout(config.layout)
     device = config.device
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        policy = Executor().to(device)
+        policy = Executor(len(layout.routes)).to(device)
     generator = torch.Generator(device).manual_seed(seed)
-    driving = Driving(load_layout(config.layout), FrozenEncoder(encoder, device, config.precision), config.envs, rng)
+    driving = Driving(layout, FrozenEncoder(encoder, device, config.precision), config.envs, rng)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.lr, eps=1e-5, fused=True)
     updates = max(1, config.steps // (config.rollout * config.envs))
     curves, kept = [], {}

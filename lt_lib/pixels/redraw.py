@@ -19,13 +19,12 @@ from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
 from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.arena import HORIZON, Arena
 from lt_lib.envs.camera import FastCamera
-from lt_lib.envs.layout import load_layout
+from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.renewal import renew
 from lt_lib.pixels.episodes import (
     ARRIVAL_REWARD,
     CONTACT_REWARD,
-    SLABS,
     Draws,
     Outcomes,
     Seats,
@@ -254,7 +253,7 @@ def train_redrawn_head(
     episodes, updates = [], []
     for start in range(0, config.episodes, config.batch):
         n = min(config.batch, config.episodes - start)
-        entry, slab = rng.integers(0, len(spawn), n), rng.integers(0, SLABS, n)
+        entry, slab = rng.integers(0, len(spawn), n), rng.integers(0, len(SIDES), n)
         chance = rng.random((n, draws_per_episode(config.every, commit_step)))
         outcome, decisions = arena.play(head, Draws(spawn[entry], scout[entry]), slab, chance)
         entropy = _improve(head, optimiser, outcome, decisions, config, rng)

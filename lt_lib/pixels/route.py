@@ -19,7 +19,7 @@ from lt_lib.comm.route_head import RouteHead
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
-from lt_lib.pixels.episodes import SLABS, Outcomes, held_out_draws
+from lt_lib.pixels.episodes import Outcomes, held_out_draws
 from lt_lib.settings.pixels import EvaluationConfig, HeadConfig
 from lt_lib.settings.streams import Stream
 from lt_lib.store.states import restored, state_of
@@ -34,11 +34,13 @@ class Bank(NamedTuple):
     scout: Float[np.ndarray, "e 2"]
     navigator: Float[np.ndarray, "e 2"]  # at the commit step, until which it waits at its spawn
     outcomes: Outcomes  # (E, slab, route)
+    blocks: Bool[np.ndarray, "slab route"]  # whether a placement of the slabs blocks a route
     commit_step: int
 
     def take(self, entries: slice | Bool[np.ndarray, " e"]) -> "Bank":
         kept = (values[entries] for values in self[:3])
-        return Bank(*kept, Outcomes(*(values[entries] for values in self.outcomes)), self.commit_step)
+        outcomes = Outcomes(*(values[entries] for values in self.outcomes))
+        return Bank(*kept, outcomes, self.blocks, self.commit_step)
 
     def wires(
         self, channel: Channel, entry: Int[np.ndarray, " b"], slab: Int[np.ndarray, " b"]
@@ -71,7 +73,7 @@ def sent_contents(
 ) -> Float[Tensor, "e slab c"]:
     """What the scout sends under each slab placement while the navigator waits at its spawn."""
     camera, contents = FastCamera(layout), []
-    for slab in range(SLABS):
+    for slab in range(len(layout.placements)):
         slabs = np.full(len(spawn), slab)
         frames = camera.frames(scout, slabs, spawn[:, :2])
         parts = []
@@ -93,9 +95,10 @@ def sent_wires(
 ) -> Float[Tensor, "e slab w"]:
     """What reaches the navigator at the commit step of each draw of the scene, under each slab placement."""
     contents = sent_contents(layout, encoder, content, spawn, scout)  # (e, slab, c)
-    channel = Channel((SLABS * len(spawn),), contents.shape[-1], layout.communication_radius)
-    places = (np.repeat(poses[:, :2], SLABS, axis=0) for poses in (scout, spawn))  # (e * slab, 2)
-    return committed_wires(channel, commit_step, contents.flatten(0, 1), *places).unflatten(0, (-1, SLABS))
+    slabs = contents.shape[1]
+    channel = Channel((slabs * len(spawn),), contents.shape[-1], layout.communication_radius)
+    places = (np.repeat(poses[:, :2], slabs, axis=0) for poses in (scout, spawn))  # (e * slab, 2)
+    return committed_wires(channel, commit_step, contents.flatten(0, 1), *places).unflatten(0, (-1, slabs))
 
 
 def read_bank(
@@ -106,7 +109,7 @@ def read_bank(
     spawn, scout = bank["spawn"], bank["scout"]
     contents = sent_contents(layout, frozen, config.content, spawn, scout)
     outcomes = Outcomes(**{name: bank[name] for name in Outcomes._fields})
-    whole = Bank(contents, scout[:, :2], spawn[:, :2], outcomes, bank["commit_step"])
+    whole = Bank(contents, scout[:, :2], spawn[:, :2], outcomes, layout.blocks, bank["commit_step"])
     held_out = held_out_draws(bank)
     return whole.take(slice(held_out, None)), whole.take(slice(held_out))
 
@@ -171,12 +174,12 @@ def learn(
     episodes, updates = [], []
     for start in range(0, config.episodes, config.batch):
         n = min(config.batch, config.episodes - start)
-        entry, slab = rng.integers(0, len(training.contents), n), rng.integers(0, SLABS, n)
+        entry, slab = (rng.integers(0, many, n) for many in training.contents.shape[:2])
         wire = training.wires(channel, entry, slab)
         with torch.no_grad():
             policy, value = head.outlook(wire)
-            route = torch.from_numpy((rng.random(n) < policy.probs[:, 1].numpy()).astype(np.int64))
-        played = _played(training.outcomes, entry, slab, route.numpy())
+            route = torch.from_numpy(drawn(policy.probs.numpy(), rng))
+        played = _played(training, entry, slab, route.numpy())
         returns = torch.from_numpy(played.pop("returns")).float()
         batch = ppo.Batch(wire, route, policy.log_prob(route), returns - value, returns)
         statistics = ppo.update(head, optimiser, batch, config.ppo, config.minibatch, rng)
@@ -196,23 +199,29 @@ def evaluate(head: RouteHead, held_out: Bank, channel: Channel, rng: np.random.G
     The held-out draws are taken in turn. Returns "optimal", "success", "contacts", "length", "route", each (episodes,).
     """
     n = channel.senders
-    entry, slab = np.arange(n) % len(held_out.contents), rng.integers(0, SLABS, n)
+    entry, slab = np.arange(n) % len(held_out.contents), rng.integers(0, held_out.contents.shape[1], n)
     route = head.policy(held_out.wires(channel, entry, slab)).logits.argmax(1).numpy()
-    played = _played(held_out.outcomes, entry, slab, route)
+    played = _played(held_out, entry, slab, route)
     played.pop("returns")
     return played | {"route": route}
 
 
+def drawn(shares: Float[np.ndarray, "b c"], rng: np.random.Generator) -> Int[np.ndarray, " b"]:
+    """A route for each row, with the probabilities of its c routes."""
+    above = shares[:, :0:-1].cumsum(axis=1)  # (b, c - 1): of the last route, of the last two, ...
+    return (rng.random(len(shares))[:, None] < above).sum(axis=1)
+
+
 def _played(
-    outcomes: Outcomes,
+    bank: Bank,
     entry: Int[np.ndarray, " b"],
     slab: Int[np.ndarray, " b"],
     route: Int[np.ndarray, " b"],
 ) -> dict[str, np.ndarray]:
     """Outcomes of episodes; optimal when the committed corridor is the slab-free one."""
-    at = (entry, slab, route)
+    at, outcomes = (entry, slab, route), bank.outcomes
     return {
-        "optimal": route != slab,
+        "optimal": ~bank.blocks[slab, route],
         "success": outcomes.success[at],
         "contacts": outcomes.contacts[at],
         "length": outcomes.length[at],

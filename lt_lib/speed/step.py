@@ -11,8 +11,8 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.perception.encoder import FrozenEncoder
-from lt_lib.pixels.episodes import SLABS, draw_scenes
-from lt_lib.pixels.executor import ROUTES, FrozenExecutor
+from lt_lib.pixels.episodes import draw_scenes
+from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.speed.turns import taking_turns
 from lt_lib.store.run import Result
 
@@ -92,6 +92,6 @@ def encoder_passes(layout: Layout, encoder: Result) -> dict[str, int]:
 def _started(layout: Layout, envs: int) -> tuple[Arena, np.ndarray]:
     """An arena at the start of its episodes, and a commanded route (envs,) for each."""
     arena, rng = Arena(layout, envs), np.random.default_rng(0)
-    draws, route = draw_scenes(layout, envs, rng), rng.integers(0, ROUTES, envs)
-    arena.reset(np.ones(envs, bool), draws.spawn, rng.integers(0, SLABS, envs), draws.scout)
+    draws, route = draw_scenes(layout, envs, rng), rng.integers(0, len(layout.routes), envs)
+    arena.reset(np.ones(envs, bool), draws.spawn, rng.integers(0, len(layout.placements), envs), draws.scout)
     return arena, route

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lt_lib.envs.arena import NO_CORRIDOR, Arena
+from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
-from lt_lib.envs.layout import SIDES, Layout, load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, SIDES, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, FrozenEncoder
-from lt_lib.pixels.episodes import SLABS, draw_scenes
+from lt_lib.pixels.episodes import draw_scenes
 from lt_lib.settings.base import LATENCY
 from lt_lib.settings.streams import Stream
 from lt_lib.settings.velocity import Boost, Exploration, RolloutConfig
@@ -196,7 +196,7 @@ def roll_navigator(
     rng = Stream.ROLLOUT.generator(seed, config.content, config.start, *map(str, config.rows))
     shape = (len(config.rows), config.episodes)
     fixed = None if config.blocked == "random" else SIDES.index(config.blocked)
-    slab = rng.integers(0, SLABS, shape) if fixed is None else np.full(shape, fixed)
+    slab = rng.integers(0, len(SIDES), shape) if fixed is None else np.full(shape, fixed)
     imposed = Imposed(
         *(np.repeat([getattr(row, name) for row in config.rows], config.episodes) for name in Imposed._fields)
     )

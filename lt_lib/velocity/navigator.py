@@ -16,10 +16,10 @@ from torch.nn import functional as F
 from lt_lib import ppo
 from lt_lib.comm.channel import ANCHOR, Channel
 from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
-from lt_lib.envs.arena import NO_CORRIDOR, Arena
+from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.geodesic import RouteDistance
-from lt_lib.envs.layout import SIDES, Layout, load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, SIDES, Layout, load_layout
 from lt_lib.perception.encoder import ACTION, LATENT, FrozenEncoder
 from lt_lib.perception.frames import free_poses
 from lt_lib.settings.streams import Stream
