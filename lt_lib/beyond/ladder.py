@@ -14,7 +14,7 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import SIDES, Layout
 from lt_lib.envs.materials import HAZARD, INDEX, PALETTE
 from lt_lib.envs.occlusion import hazard_pixels
-from lt_lib.perception.appearance import draw_appearances, eight_bits, recoloured
+from lt_lib.perception.appearance import draw_palettes, eight_bits
 from lt_lib.settings.base import UserError
 from lt_lib.settings.beyond import Rung
 
@@ -71,19 +71,24 @@ def objects(layout: Layout, scout: Float[np.ndarray, "e 3"], rng: np.random.Gene
     raise UserError(f"layout {layout.name}: no room for an object in front of the scout; move the scout into the open")
 
 
-def photographed(frames: UInt8[np.ndarray, "n h w"], rung: Rung, rng: np.random.Generator):
-    """Pictures (n, h, w, 3) of palette-index frames as a rung shows them."""
+def photographed(
+    frames: UInt8[np.ndarray, "n h w"], rung: Rung, rng: np.random.Generator
+) -> UInt8[np.ndarray, "n h w 3"]:
+    """Pictures of palette-index frames as a rung shows them, each in a palette of its own."""
     if rung.noise:
         random = rng.integers(0, len(PALETTE), frames.shape, dtype=np.uint8)
         frames = np.where(rng.random(frames.shape, np.float32) < rung.noise, random, frames)
-    looks = draw_appearances(len(frames), frames.shape[-1], rung.appearance, 0.0, rng)
+    palettes = draw_palettes(len(frames), rung.appearance, rng)
     if rung.redness is not None:
         own, red = (PALETTE[INDEX[name]] / 255 for name in ("robot", "slab_x"))
-        looks.palettes[:, INDEX["robot"]] = (1 - rung.redness) * own + rung.redness * red
-    colours = recoloured(frames, looks)
+        palettes[:, INDEX["robot"]] = (1 - rung.redness) * own + rung.redness * red
     if rung.exposure:
-        colours *= np.exp2(rng.normal(0, rung.exposure, (len(frames), 1, 1, 1))).astype(np.float32)
-    return eight_bits(np.minimum(colours, 1))
+        palettes *= np.exp2(rng.normal(0, rung.exposure, (len(frames), 1, 1))).astype(np.float32)
+    shown = eight_bits(np.minimum(palettes, 1))
+    out = np.empty((*frames.shape, 3), np.uint8)
+    for i in range(len(frames)):  # one small look-up after another is faster than a large one
+        np.take(shown[i], frames[i], axis=0, out=out[i])
+    return out
 
 
 def drawn(n: int, propose, accept) -> Float[np.ndarray, "n 3"]:

@@ -70,7 +70,7 @@ def _cm(value: float) -> float:
 
 def written(layout: Layout) -> str:
     """A layout as the text of its YAML file."""
-    head = "# Made by lt_lib/beyond/layouts.py; lengths in metres, angles in degrees.\n"
+    head = "# Made in lt_lib/beyond; lengths in metres, angles in degrees.\n"
     return head + yaml.safe_dump(layout.model_dump(mode="json"), sort_keys=False, default_flow_style=None)
 
 

@@ -65,6 +65,12 @@ class ControlProtocol:
     def store(self) -> RunStore:
         return self.pixels.store
 
+    def train_all(self) -> None:
+        """Trains encoder and senders side by side, for whoever asks for them later."""
+        ours = [] if self.pixels.weights else [Run(train_encoder, self.pixels.sizes.encoder, SEED)]
+        plain = self._runs([name for name in SENDERS if name != PAPER_S], self.sizes.sender)
+        self.store.fetch([*ours, *plain.values(), *self._runs(RETRAINED, self._recoloured).values()], "senders")
+
     def senders(self, encoder: Result) -> dict[str, list[Result]]:
         """Every frozen sender by name, several of those that are drawn; the JEPA sender is the paper's encoder.
 
@@ -75,17 +81,23 @@ class ControlProtocol:
 
     def recoloured_senders(self) -> dict[str, list[Result]]:
         """Some senders trained on frames whose floor and walls have random colours."""
-        return self._trained(RETRAINED, self.sizes.recoloured.model_copy(update={"colour": self.sizes.colour}))
+        return self._trained(RETRAINED, self._recoloured)
 
-    def _trained(self, names: Sequence[str], config: SenderConfig) -> dict[str, list[Result]]:
-        runs = {
+    @property
+    def _recoloured(self) -> SenderConfig:
+        return self.sizes.recoloured.model_copy(update={"colour": self.sizes.colour})
+
+    def _runs(self, names: Sequence[str], config: SenderConfig) -> dict[tuple[str, int], Run]:
+        return {
             (name, seed): Run(
                 SENDERS[name].train, config.model_copy(update={"kind": name, **SENDERS[name].changes}), seed
             )
             for name in names
             for seed in range(self.sizes.drawn if name in DRAWN else 1)
         }
-        trained = fetch_by_name(self.store.fetch, runs, "senders")
+
+    def _trained(self, names: Sequence[str], config: SenderConfig) -> dict[str, list[Result]]:
+        trained = fetch_by_name(self.store.fetch, self._runs(names, config), "senders")
         return {name: [frozen(each) for each in results] for name, results in trained.items()}
 
     def gate_reports(self, senders: Mapping[str, list[Result]], colour: float = 0.0) -> dict[str, list[Result]]:

@@ -88,7 +88,7 @@ def projection(
 
 
 class Autoencoder(nn.Module):
-    """The encoder and its mirror image, which rebuilds the picture (B, 64, 64, 3) from the latent."""
+    """The encoder and a mirror image of half its width, which rebuilds the picture (B, 64, 64, 3) from the latent."""
 
     def __init__(self):
         super().__init__()
@@ -97,11 +97,11 @@ class Autoencoder(nn.Module):
             nn.Linear(LATENT, 1024),
             nn.Unflatten(1, (64, 4, 4)),
             nn.ReLU(),
-            nn.ConvTranspose2d(64, 64, kernel_size=3),
-            nn.ReLU(),  # (B, 64, 6, 6)
-            nn.ConvTranspose2d(64, 32, kernel_size=4, stride=2, output_padding=1),
-            nn.ReLU(),  # (B, 32, 15, 15)
-            nn.ConvTranspose2d(32, 3, kernel_size=8, stride=4),
+            nn.ConvTranspose2d(64, 32, kernel_size=3),
+            nn.ReLU(),  # (B, 32, 6, 6)
+            nn.ConvTranspose2d(32, 16, kernel_size=4, stride=2, output_padding=1),
+            nn.ReLU(),  # (B, 16, 15, 15)
+            nn.ConvTranspose2d(16, 3, kernel_size=8, stride=4),
         )
 
     def forward(self, pictures: Float[Tensor, "b 64 64 3"]) -> Float[Tensor, "b 64 64 3"]:

@@ -33,6 +33,12 @@ class Appearances(NamedTuple):
 
 def draw_appearances(n: int, pixels: int, colour: float, texture: float, rng: np.random.Generator) -> Appearances:
     """colour: share of the own colour that a random one replaces; texture: standard deviation of the blotches."""
+    palettes = draw_palettes(n, colour, rng)
+    return Appearances(palettes, _blotches(n, pixels, texture, rng))
+
+
+def draw_palettes(n: int, colour: float, rng: np.random.Generator) -> Float[np.ndarray, "n colours 3"]:
+    """Colours in [0, 1] of every material, floor and walls random to the share `colour`."""
     own = np.tile(PALETTE.astype(np.float32) / 255, (n, 1, 1))
     random = own.copy()
     for names in SURFACES:
@@ -42,7 +48,7 @@ def draw_appearances(n: int, pixels: int, colour: float, texture: float, rng: np
         shade[np.arange(n), rng.integers(0, 2, n)] = rng.uniform(*SHADES, n)
         for i, name in enumerate(names):
             random[:, INDEX[name]] = base * shade[:, i, None]
-    return Appearances((1 - colour) * own + np.float32(colour) * random, _blotches(n, pixels, texture, rng))
+    return (1 - colour) * own + np.float32(colour) * random
 
 
 def _blotches(n: int, pixels: int, deviation: float, rng: np.random.Generator) -> Float[np.ndarray, "n h w"]:
@@ -60,5 +66,5 @@ def recoloured(frames: UInt8[np.ndarray, "b h w"], looks: Appearances) -> Float[
     return out
 
 
-def eight_bits(colours: Float[np.ndarray, "b h w 3"]) -> UInt8[np.ndarray, "b h w 3"]:
+def eight_bits(colours: Float[np.ndarray, "*shape 3"]) -> UInt8[np.ndarray, "*shape 3"]:
     return np.round(colours * 255).astype(np.uint8)

@@ -1,0 +1,68 @@
+"""Arenas with C corridors from one generator: physics, camera, occlusion check and executor follow from the layout.
+
+    python -m lt_lib.beyond.corridors      writes params/layouts/corridors_<C>.yaml again
+
+All corridors are alike, side by side, and bend the same way; the arena, the scout's distance and the goal's grow with
+their number, so that the scout still sees every slab. One corridor is free, the others are blocked.
+"""
+
+import numpy as np
+
+from lt_lib.beyond.layouts import written
+from lt_lib.envs.layout import Layout, load_layout
+from lt_lib.envs.occlusion import require_occlusion
+from lt_lib.settings.base import LAYOUTS
+
+COUNTS = (2, 3, 4, 6)
+PITCH, OFFSET, HALF = 1.7, 0.95, 0.3  # metres: between corridors, from mouth to exit, half a corridor's width
+MARGIN = 1.1  # of the scout's distance, over the one from which it just sees the outermost slabs
+
+
+def corridor_layout(count: int) -> Layout:
+    """An arena with `count` corridors, numbered from the left, of which one is free.
+
+    Raises UserError if the navigator sees a slab from where it chooses, or the scout does not see one.
+    """
+    values = load_layout("default").model_dump(mode="json")
+    near, far = values["barrier"]
+    mouths = [(count - 1) / 2 * PITCH + OFFSET / 2 - i * PITCH for i in range(count)]
+    exits = [mouth - OFFSET for mouth in mouths]
+    outer, middle = mouths[0] + HALF + 0.5, (exits[0] + exits[-1]) / 2
+    sight = np.tan(np.deg2rad(values["camera"]["fov"] / 2))
+    scout = far + HALF + MARGIN * (exits[0] - middle + HALF) / sight
+    layout = Layout(
+        **values
+        | {
+            "name": f"corridors_{count}",
+            "blocked": "all but one",
+            "arena": {"x": [values["arena"]["x"][0], _cm(scout + 3.0)], "y": [_cm(-outer), _cm(outer)]},
+            "corridors": [_corridor(near, far, mouth, out) for mouth, out in zip(mouths, exits, strict=True)],
+            "scout": values["scout"] | {"x": _cm(scout), "y": _cm(middle)},
+            "goal": values["goal"] | {"x": _cm(scout + 2.0), "y": _cm(middle)},
+            "choice_points": [{"x": _cm(near - 0.3), "y": _cm(mouth), "heading": 0.0} for mouth in mouths],
+        }
+    )
+    require_occlusion(layout)
+    return layout
+
+
+def _corridor(near: float, far: float, mouth: float, out: float) -> dict:
+    legs = [
+        ((near, 0.6), (mouth - HALF, mouth + HALF)),
+        ((0.0, 0.6), (out - HALF, mouth + HALF)),
+        ((0.0, far), (out - HALF, out + HALF)),
+    ]
+    return {"legs": [_rect(x, y) for x, y in legs], "slab": _rect((far - HALF, far + HALF), (out - HALF, out + HALF))}
+
+
+def _rect(x: tuple[float, float], y: tuple[float, float]) -> dict:
+    return {"x": [_cm(value) for value in x], "y": [_cm(value) for value in y]}
+
+
+def _cm(value: float) -> float:
+    return round(float(value), 2)
+
+
+if __name__ == "__main__":
+    for count in COUNTS:
+        (LAYOUTS / f"corridors_{count}.yaml").write_text(written(corridor_layout(count)), encoding="utf-8")
