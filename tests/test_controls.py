@@ -148,6 +148,14 @@ def test_the_supervised_sender_learns_the_blocked_corridor(monkeypatch):
     assert given["loss"] == pytest.approx(given["expected"], rel=1e-4)
 
 
+def test_a_sender_that_is_taught_where_the_slab_shows_sees_no_other_frame(monkeypatch):
+    seen = []
+    monkeypatch.setattr(senders.Judging, "loss", lambda self, pictures, r, t: (
+        seen.append(pictures.rollouts.frames[r, t]), self.logit.bias.square())[1])  # fmt: skip
+    trained("supervised_showing")
+    assert seen and all(HAZARD[frames].any((1, 2)).all() for frames in seen)
+
+
 def test_the_autoencoder_learns_to_rebuild_what_it_sees():
     result = trained("autoencoder", epochs=10.0, lr=3e-3, batch=32)
     assert result["loss"][-1] < result["loss"][0] / 4

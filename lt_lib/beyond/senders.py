@@ -128,16 +128,31 @@ class Judging(nn.Module):
         super().__init__()
         self.encoder, self.logit = Encoder(), nn.Linear(LATENT, 1)
 
+    def loss(self, pictures: Pictures, r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Float[Tensor, "1"]:
+        """Cross-entropy of the blocked corridor in frames t of rollouts r."""
+        device = self.logit.weight.device
+        seen, slab = (torch.from_numpy(each).to(device) for each in (pictures.colours(r, t), pictures.rollouts.slab[r]))
+        return F.binary_cross_entropy_with_logits(self.logit(self.encoder(seen)).squeeze(1), slab.float())[None]
+
 
 def supervised(config: SenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
     """The same encoder trained to name the blocked corridor, which needs labels; most frames do not show it."""
 
     def terms(model: Judging, pictures: Pictures) -> Terms:
-        slab = torch.from_numpy(pictures.rollouts.slab).float()
+        return lambda r, t: model.loss(pictures, r, t)
 
-        def loss(r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Float[Tensor, "1"]:
-            latent = model.encoder(torch.from_numpy(pictures.colours(r, t)).to(config.device))
-            return F.binary_cross_entropy_with_logits(model.logit(latent), slab[r, None].to(config.device))[None]
+    return trained(Judging, terms, config, seed, report)
+
+
+def supervised_where_it_shows(config: SenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
+    """As `supervised`, from frames that show the slab alone: others say nothing of where it stands."""
+    rng = Stream.SENDER.generator(seed, "showing")
+
+    def terms(model: Judging, pictures: Pictures) -> Terms:
+        showing = np.argwhere(hazard_visible(pictures.rollouts.frames))  # (frames, 2): rollout, time
+
+        def loss(r: Int[np.ndarray, " b"], _: Int[np.ndarray, " b"]) -> Float[Tensor, "1"]:
+            return model.loss(pictures, *rng.choice(showing, len(r)).T)
 
         return loss
 
@@ -226,6 +241,7 @@ SENDERS = {
     "random": Sender("random projection", random_projection, FEW),
     "untrained": Sender("untrained encoder", jepa, {"epochs": 0.0, **FEW}),
     "supervised": Sender("supervised on the hazard bit", supervised),
+    "supervised_showing": Sender("supervised where the slab shows", supervised_where_it_shows),
     "silence": Sender("silence", silence, FEW),
 }
 

@@ -10,6 +10,7 @@ intervals     Student's over seeds, but never narrower than Wilson's over the ep
 Outcomes are arrays (seeds, episodes) of 0 and 1. Standard deviations are those of a sample (ddof = 1).
 """
 
+import warnings
 from collections import Counter
 from math import comb, log10
 from operator import index
@@ -211,7 +212,11 @@ def longer_mean(values: ArrayLike, other: ArrayLike) -> float:
     """One-sided Welch p that the first of two samples has the greater mean; without any spread, 0 or 1."""
     if np.ptp(values) == 0 and np.ptp(other) == 0:
         return float(np.mean(values) <= np.mean(other))
-    return float(stats.ttest_ind(values, other, equal_var=False, alternative="greater").pvalue)
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", "Precision loss", RuntimeWarning
+        )  # of a sample without spread, which is exact
+        return float(stats.ttest_ind(values, other, equal_var=False, alternative="greater").pvalue)
 
 
 def paired_drop(one: Shaped[np.ndarray, " n"], other: Shaped[np.ndarray, " n"]) -> float:
