@@ -97,12 +97,14 @@ def test_words_that_no_value_of_a_setting_makes_true_are_not_reproduced():
 def test_a_changed_file_is_told_and_a_broken_one_refused(tmp_path):
     path, record = tmp_path / "inferred.yaml", tmp_path / RECORD
     path.write_text("a: 1")
-    assert not register("settings", path, record).changed
+    assert not register("settings", path.read_bytes(), record).changed
     path.write_text("a: 2")
-    assert "CHANGED AFTER THE FACT: the settings were registered" in str(register("settings", path, record))
+    assert "CHANGED AFTER THE FACT: the settings were registered" in str(
+        register("settings", path.read_bytes(), record)
+    )
     record.write_text("nothing")
     with pytest.raises(UserError, match="not a record of registered settings"):
-        register("settings", path, record)
+        register("settings", path.read_bytes(), record)
     for text, complaint in {
         "a: 1": "expected a list",
         "- {setting: a}": "inferred.yaml: a.what: Field required",

@@ -22,7 +22,8 @@ PATH = CONTENT // 2 - 1  # points of the constant-velocity path besides the posi
 class Sender(NamedTuple):
     """What b senders know when they send.
 
-    `velocity` is in m/s, zero for a stationary scout; `slab` is the truth (0 left, 1 right), for the oracle only.
+    `velocity` is in m/s, zero for a stationary scout; `slab` is the true placement of the slabs (with two corridors, 0
+    left, 1 right), for messages by hand only.
     """
 
     layout: Layout
@@ -70,6 +71,18 @@ def oracle(sender: Sender) -> Float[Tensor, "b 64"]:
     return _padded(sender.slab[:, None])
 
 
+def half(sender: Sender) -> Float[Tensor, "b 64"]:
+    """One bit by hand: whether a corridor of the left half is free, zero-padded."""
+    free = ~sender.layout.blocks[sender.slab]  # (b, c)
+    return _padded(free[:, : free.shape[1] // 2].any(axis=1)[:, None])
+
+
+def state(sender: Sender) -> Float[Tensor, "b 64"]:
+    """The placement's number in binary, by a hand that knows the task, zero-padded."""
+    bits = max(1, (len(sender.layout.placements) - 1).bit_length())
+    return _padded(sender.slab[:, None] >> np.arange(bits) & 1)
+
+
 def _padded(values) -> Float[Tensor, "b 64"]:
     out = torch.zeros(len(values), CONTENT)
     out[:, : values.shape[1]] = torch.from_numpy(values)
@@ -85,7 +98,7 @@ class Condition(NamedTuple):
     words: str
 
 
-CONTENTS = {f.__name__: f for f in (floor, position, trajectory, latent, predicted, raw, oracle)}
+CONTENTS = {f.__name__: f for f in (floor, position, trajectory, latent, predicted, raw, oracle, half, state)}
 CONDITIONS = {
     "latent": Condition("latent", "intact", "ours", "latent $z_t$"),
     "predicted": Condition("predicted", "intact", "ours", r"predicted $\hat{z}_{t+1}$"),
@@ -95,4 +108,6 @@ CONDITIONS = {
     "zero_wire": Condition("floor", "wire_zeroed", "lower bound", "floor, whole wire zeroed"),
     "position": Condition("position", "intact", "kinematic", "position"),
     "trajectory": Condition("trajectory", "intact", "kinematic", "trajectory"),
+    "half": Condition("half", "intact", "diagnostic", "one bit: left half or right"),
+    "state": Condition("state", "intact", "diagnostic", "the whole state by hand"),
 }

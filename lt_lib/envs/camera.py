@@ -16,7 +16,8 @@ from lt_lib.envs.raycast import draw, expand
 class FastCamera:
     """Draws what a robot sees, in float32 and on one thread."""
 
-    def __init__(self, layout: Layout, pixels: int | None = None):
+    def __init__(self, layout: Layout, pixels: int | None = None, slabs: Float[np.ndarray, "p k 4"] | None = None):
+        """slabs: footprints (x0, x1, y0, y1) of k slabs under each of p placements, the layout's own by default."""
         self.pixels = pixels or layout.camera.pixels
         self._eye_height = np.float32(layout.camera.height)
         self._tan = np.float32(np.tan(np.deg2rad(layout.camera.fov) / 2))
@@ -24,7 +25,7 @@ class FastCamera:
         self._wall_index = np.array([INDEX[f"{wall.material}_x"] for wall in layout.walls], np.uint8)  # (W,)
         self._wall_height = np.float32(layout.wall_height)
         boxes = [[layout.slab(side).bounds for side in blocked] for blocked in layout.placements]
-        self._slabs = np.array(boxes, np.float32)  # (placements, slabs, 4)
+        self._slabs = np.array(boxes if slabs is None else slabs, np.float32)  # (placements, slabs, 4)
         self._slab_height = np.float32(layout.slab_height)
         self._goal = np.array([layout.goal.x, layout.goal.y, *GOAL_PILLAR], np.float32)  # (4,) x, y, radius, height
         self._robot = np.array([layout.robot.radius, layout.robot.height], np.float32)  # (2,)

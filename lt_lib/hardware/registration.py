@@ -19,7 +19,7 @@ def registered_gates(outputs: Path, path: Path = GATES) -> tuple[HardwareGates, 
 
     Raises UserError, one line, for a gate file or a record that cannot be read.
     """
-    return read_gates(path), register("gates", path, Path(outputs) / RECORD)
+    return read_gates(path), register("gates", path.read_bytes(), Path(outputs) / RECORD)
 
 
 def read_gates(path: Path = GATES) -> HardwareGates:

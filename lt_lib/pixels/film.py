@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lt_lib.envs.arena import CONTROL_HZ, HORIZON, Arena
 from lt_lib.envs.camera import FastCamera, colours
-from lt_lib.envs.layout import SIDES, Layout
+from lt_lib.envs.layout import Layout
 from lt_lib.envs.reference import TopView
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.episodes import Draws
@@ -23,7 +23,7 @@ BAND = 22  # pixels of caption above the pictures
 
 
 class Take(NamedTuple):
-    """One recorded episode: poses (T, 3) of the navigator, the scout's (3,), slab and route (0 left, 1 right)."""
+    """One recorded episode: poses (T, 3) of the navigator, the scout's (3,), placement of the slabs, and route."""
 
     poses: Float[np.ndarray, "t 3"]
     scout: Float[np.ndarray, "3"]
@@ -64,7 +64,8 @@ def pictures(layout: Layout, take: Take, every: int, title: str, height: int = 2
         seen = colours(eye.frames(pose[None], slab, take.scout[None, :2]))[0]
         sent = colours(eye.frames(take.scout[None], slab, pose[None, :2]))[0]
         gap = np.full((height, 6, 3), 255, np.uint8)
-        words = f"{title}: slab {SIDES[take.slab]}, head chose {SIDES[take.route]}; {step / CONTROL_HZ:.0f} s"
+        slabs = " ".join(layout.sides[side] for side in layout.placements[take.slab])
+        words = f"{title}: slab {slabs}, head chose {layout.sides[take.route]}; {step / CONTROL_HZ:.0f} s"
         frames.append(_captioned(np.concatenate([above, gap, seen, gap, sent], axis=1), words, above.shape[1]))
     return frames
 
@@ -103,16 +104,31 @@ def film_pair(
 
     The slab is in the corridor that the floor's head prefers, so that the pair shows what the message contributes.
     """
-    draws = Draws(bank["spawn"][:1], bank["scout"][:1])
     frozen, driver = FrozenEncoder(encoder), FrozenExecutor(executor)
-    wires = {
-        name: sent_wires(layout, frozen, name, *draws, commit_step)[0] for name in ("floor", "latent")
-    }  # (slab, w)
-    slab = int(read_head(heads["floor"][0]).policy(wires["floor"]).probs[0].argmax())
-    paths = []
-    for name, wire in wires.items():
-        route = int(read_head(heads[name][0]).policy(wire).probs[slab].argmax())
-        take = record(layout, frozen, driver, draws, 0, slab, route, commit_step)
-        every = max(1, len(take.poses) // 40)
-        paths.append(save_gif(folder / "figures" / f"04_{name}.gif", pictures(layout, take, every, f"message: {name}")))
-    return paths
+    draws = Draws(bank["spawn"][:1], bank["scout"][:1])
+    nothing = sent_wires(layout, frozen, "floor", *draws, commit_step)[0, 0]
+    slab = int(read_head(heads["floor"][0]).policy(nothing[None]).probs[0].argmax())
+    crew = frozen, driver, commit_step
+    return [
+        film(layout, heads[name][0], name, draws, slab, *crew, folder / "figures" / f"04_{name}.gif")
+        for name in ("floor", "latent")
+    ]
+
+
+def film(
+    layout: Layout,
+    head: Result,
+    content: str,
+    draws: Draws,
+    slab: int,
+    encoder: FrozenEncoder,
+    executor: FrozenExecutor,
+    commit_step: int,
+    path: Path,
+) -> Path:
+    """Films the first of some draws of the scene, under one placement of the slabs, with a head's greedy choice."""
+    wire = sent_wires(layout, encoder, content, *draws, commit_step)[0, slab]
+    route = int(read_head(head).policy(wire[None]).probs[0].argmax())
+    take = record(layout, encoder, executor, draws, 0, slab, route, commit_step)
+    every = max(1, len(take.poses) // 40)
+    return save_gif(path, pictures(layout, take, every, f"message: {content}"))

@@ -140,7 +140,7 @@ def train_head(
     width = training.contents.shape[-1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
-        head = RouteHead(ANCHOR + width)
+        head = RouteHead(ANCHOR + width, training.blocks.shape[1])
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     course = learn(head, optimiser, training, channel_of(config, config.batch, width, rng), config, rng, report)
     greedy = evaluate(head, held_out, channel_of(config, len(held_out.contents), width, rng), rng)
@@ -247,5 +247,5 @@ def evaluate_head(
 
 def read_head(result: Mapping[str, np.ndarray]) -> RouteHead:
     """The trained head in a result of `train_head`."""
-    width = result["head.hidden.0.weight"].shape[1]
-    return restored(RouteHead(width), result, "head").requires_grad_(False)
+    width, routes = result["head.hidden.0.weight"].shape[1], len(result["head.logits.bias"])
+    return restored(RouteHead(width, routes), result, "head").requires_grad_(False)

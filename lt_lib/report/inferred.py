@@ -72,4 +72,4 @@ def calibrating_rows(path: Path = INFERRED) -> dict[str, str]:
 
 def registered(outputs: Path) -> Registration:
     """The checksum of inferred.yaml at its first use in an outputs folder, and now."""
-    return register("inferred settings", INFERRED, Path(outputs) / RECORD)
+    return register("inferred settings", INFERRED.read_bytes(), Path(outputs) / RECORD)

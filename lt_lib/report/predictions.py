@@ -15,7 +15,6 @@ from lt_lib.settings.base import ROOT, Settings, UserError
 from lt_lib.store.files import content_digest, writable_folder, write_atomically
 
 PREDICTIONS = ROOT / "params" / "predictions.yaml"
-RECORD = "predictions.json"
 HELD, NOT_HELD, NO_VERDICT = "held", "did not hold", ""
 
 
@@ -105,6 +104,8 @@ class Predictions:
         return pd.DataFrame(rows, index=pd.Index(self.predicted, name="prediction"), columns=columns)
 
 
-def registered(outputs: Path) -> Registration:
-    """The checksum of predictions.yaml at its first use in an outputs folder, and now."""
-    return register("predictions", PREDICTIONS, Path(outputs) / RECORD)
+def registered(notebook: str, outputs: Path) -> Registration:
+    """The checksum of a notebook's entries in predictions.yaml at their first use in an outputs folder, and now."""
+    entries = [entry.model_dump() for entry in read_entries(PREDICTIONS, Prediction, "id").values()]
+    own = json.dumps([entry for entry in entries if entry["nb"] == notebook], sort_keys=True)
+    return register("predictions", own.encode(), Path(outputs) / f"predictions_{notebook}.json")

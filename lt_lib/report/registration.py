@@ -31,14 +31,14 @@ class Registration(NamedTuple):
         return f"{self.what} registered on {self.first_use}, sha256 {self.digest[:12]}, unchanged since"
 
 
-def register(what: str, path: Path, record: Path) -> Registration:
-    """The first time, leaves a file's checksum in `record`; later, compares with it.
+def register(what: str, content: bytes, record: Path) -> Registration:
+    """The first time, leaves the checksum of a file's content in `record`; later, compares with it.
 
-    what  the file's content in a word or two, plural
+    what  the content in a word or two, plural
 
     Raises a one-line UserError for a record that cannot be read.
     """
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = hashlib.sha256(content).hexdigest()
     if not record.exists():
         now = datetime.now(UTC).isoformat(timespec="seconds")
         write_atomically(record, (json.dumps({"sha256": digest, "first_use": now}, indent=1) + "\n").encode())

@@ -14,12 +14,14 @@ NAVIGATOR, SCOUT = "#E69F00", "#0072B2"  # Okabe and Ito's orange and blue
 def plan(axes: Axes, layout: Layout, slab: int) -> None:
     """Draws the layout as a plan, axes in metres (Fig. 1b).
 
-    slab  0 left, 1 right: the placement that is drawn filled; the other one is dashed
+    slab  the placement that is drawn filled, with two corridors 0 left, 1 right; free corridors' slabs are dashed
     """
     for wall in layout.walls:
         axes.add_patch(_rectangle(wall.bounds, color=_colour(f"{wall.material}_x"), lw=0))
-    axes.add_patch(_rectangle(layout.slab(slab).bounds, color=_colour("slab_z"), lw=0))
-    axes.add_patch(_rectangle(layout.slab(1 - slab).bounds, fill=False, ec=_colour("slab_z"), ls="--", lw=1.2))
+    for side, blocked in enumerate(layout.blocks[slab]):
+        filled = {"color": _colour("slab_z"), "lw": 0}
+        dashed = {"fill": False, "ec": _colour("slab_z"), "ls": "--", "lw": 1.2}
+        axes.add_patch(_rectangle(layout.slab(side).bounds, **(filled if blocked else dashed)))
     axes.add_patch(Circle((layout.goal.x, layout.goal.y), layout.goal.radius, color=_colour("goal"), lw=0))
     axes.annotate("goal", (layout.goal.x, layout.goal.y), color="white", ha="center", va="center", fontsize=8)
     (x0, x1), (y0, y1) = layout.arena.x, layout.arena.y

@@ -4,10 +4,11 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
-from lt_lib.settings.base import Settings, Share
+from lt_lib.settings.base import Settings, Share, Training
 from lt_lib.settings.gridworld import GridConfig, PatchEncoderConfig
 from lt_lib.settings.perception import PictureConfig
 from lt_lib.settings.pixels import HeadConfig
+from lt_lib.settings.ppo import PpoConfig
 
 
 class SenderConfig(PictureConfig):
@@ -61,6 +62,22 @@ class EndToEndConfig(ReaderConfig):
     """A sender that learns with its head, by the receiver's policy gradient."""
 
     sender_lr: PositiveFloat = 1e-3  # of the sender's network, as in stage 1; the head keeps its own rate
+
+
+class DeciderConfig(Training):
+    """Heads that learn one task from one message (Section Route head, with other decisions)."""
+
+    decided = (*Training.decided, "task", "message")
+    task: str  # a name in beyond.tasks.TASKS
+    message: str  # a name in beyond.deciders.MESSAGES
+    scenes: Annotated[int, Field(ge=16)] = 8_192
+    held_out: Annotated[float, Field(gt=0, lt=1)] = 0.125  # of the scenes, kept for evaluation
+    episodes: PositiveInt = 6_000
+    batch: PositiveInt = 256
+    minibatch: PositiveInt = 128  # episodes
+    lr: PositiveFloat = 3e-3
+    ppo: PpoConfig = PpoConfig()
+    heads: PositiveInt = 5  # seeds
 
 
 class PatchSenderConfig(PatchEncoderConfig):
