@@ -1,6 +1,8 @@
 """Heads that learn a task of their own from a broadcast that many receive."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,14 +13,19 @@ from lt_lib import ppo
 from lt_lib.beyond.rich import RichScenes, draw_rich_scenes, rich_layout
 from lt_lib.beyond.tasks import TASKS
 from lt_lib.beyond.tasks.depth import classes
-from lt_lib.beyond.tasks.task import Task, binary
+from lt_lib.beyond.tasks.task import binary
 from lt_lib.comm.channel import anchor
 from lt_lib.comm.messages import CONTENT
 from lt_lib.comm.route_head import RouteHead
+from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.pictures import PictureEncoder
+from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.pixels.route import drawn
-from lt_lib.settings.beyond import DeciderConfig
+from lt_lib.settings.beyond import DeciderConfig, DeciderSizes
+from lt_lib.settings.profiles import validated
 from lt_lib.settings.streams import Stream
+from lt_lib.store.run import Result, Run
+from lt_lib.store.states import only
 
 Content = Callable[[RichScenes, PictureEncoder], np.ndarray]
 HAND = [task for task in TASKS.values() if task.words != "through or round"]  # tasks whose bits one hand can list
@@ -39,7 +46,7 @@ def train_deciders(
 
     "reward"  (heads, scenes) of greedy choices in held-out scenes
     "best", "chance"  (scenes,) the best action's reward there, and the mean over actions
-    "course"  (heads, episodes) reward of sampled choices, in order
+    "course"  (heads, episodes) reward of sampled choices, in order;  "floats" of the message
     """
     layout, task = rich_layout(config.layout), TASKS[config.task]
     scenes = draw_rich_scenes(layout, config.scenes, Stream.LADDER.generator(seed, "rich"))
@@ -62,6 +69,7 @@ def train_deciders(
         "best": tested.max(axis=1),
         "chance": tested.mean(axis=1),
         "course": np.stack(courses).astype(np.float32),
+        "floats": content.shape[1],
     }
 
 
@@ -95,6 +103,46 @@ def learned(
     return head, np.concatenate(course)
 
 
-def served(task: Task, message: str) -> bool:
-    """Whether a message by hand was written for this very task."""
-    return message == f"'{task.words}' by hand"
+@dataclass(frozen=True)
+class DeciderProtocol:
+    """The heads of all tasks, behind one frozen encoder."""
+
+    sizes: DeciderSizes
+    pixels: PixelProtocol
+
+    @classmethod
+    def of(
+        cls,
+        decider: Mapping[str, Any],
+        broadcast: Mapping[str, Any],
+        layout: str,
+        device: str,
+        workers: int | str,
+        weights: str,
+    ) -> "DeciderProtocol":
+        """From a notebook's parameters. Raises UserError for unusable ones."""
+        sizes = validated(DeciderSizes, "decider", dict(decider))
+        return cls(sizes, PixelProtocol.of(broadcast, layout, device, workers, weights))
+
+    def decided(self, tasks: Collection[str], messages: Collection[str]) -> dict[tuple[str, str], Result]:
+        """What heads of every task make of every message; see `train_deciders`."""
+        store, sizes = self.pixels.store, self.pixels.sizes
+        untrained = sizes.encoder.model_copy(update={"epochs": 0.0})
+        (blank,) = store.fetch([Run(train_encoder, untrained, SEED)], "untrained encoder")
+        ours = self.pixels.encoder_weights()
+        shared = self.sizes.model_dump() | {"layout": self.pixels.layout, "device": sizes.encoder.device}
+        runs = {
+            (task, message): Run(
+                train_deciders,
+                DeciderConfig(task=task, message=message, **shared),
+                SEED,
+                {"sender": _sending(blank if message == "untrained" else ours)},
+            )
+            for task in tasks
+            for message in messages
+        }
+        return dict(zip(runs, store.fetch(list(runs.values()), "receivers"), strict=True))
+
+
+def _sending(encoder: Result) -> Result:
+    return only(encoder, "E") | {name: encoder[name] for name in ("mean", "std")}

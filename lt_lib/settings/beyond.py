@@ -64,12 +64,9 @@ class EndToEndConfig(ReaderConfig):
     sender_lr: PositiveFloat = 1e-3  # of the sender's network, as in stage 1; the head keeps its own rate
 
 
-class DeciderConfig(Training):
-    """Heads that learn one task from one message (Section Route head, with other decisions)."""
+class DeciderSizes(Settings):
+    """How heads of other decisions are trained (Section Route head)."""
 
-    decided = (*Training.decided, "task", "message")
-    task: str  # a name in beyond.tasks.TASKS
-    message: str  # a name in beyond.deciders.MESSAGES
     scenes: Annotated[int, Field(ge=16)] = 8_192
     held_out: Annotated[float, Field(gt=0, lt=1)] = 0.125  # of the scenes, kept for evaluation
     episodes: PositiveInt = 6_000
@@ -78,6 +75,14 @@ class DeciderConfig(Training):
     lr: PositiveFloat = 3e-3
     ppo: PpoConfig = PpoConfig()
     heads: PositiveInt = 5  # seeds
+
+
+class DeciderConfig(DeciderSizes, Training):
+    """Heads that learn one task from one message."""
+
+    decided = (*Training.decided, "task", "message")
+    task: str  # a name in beyond.tasks.TASKS
+    message: str  # a name in beyond.deciders.MESSAGES
 
 
 class PatchSenderConfig(PatchEncoderConfig):

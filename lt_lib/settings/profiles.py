@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
 from lt_lib.settings.base import ROOT, UserError, refuse_decided, require_known
-from lt_lib.settings.beyond import ControlsConfig, Rung
+from lt_lib.settings.beyond import ControlsConfig, DeciderSizes, Rung
 from lt_lib.settings.gridworld import GridworldConfig, Scaled
 from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, RailsConfig, SessionsConfig
 from lt_lib.settings.learnability import Budget, PointMassConfig
@@ -199,5 +199,9 @@ SECTIONS: dict[str, Any] = {
     "effects": Annotated[list[str], Field(min_length=1)],
     "device": Literal["auto", "cpu", "cuda"],
     "controls": ControlsConfig,
+    "corridors": Annotated[list[Literal[2, 3, 4, 6]], Field(min_length=2)],  # those of beyond.corridors.COUNTS
+    "message_seeds": dict[str, PositiveInt],
+    "broadcast": PixelsConfig,
+    "decider": DeciderSizes,
     "rungs": Annotated[list[Rung], Field(min_length=1)],
 }
