@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float
 from statsmodels.regression.mixed_linear_model import MixedLM
 
-from lt_lib.envs.layout import SIDES, load_layout
+from lt_lib.envs.layout import load_layout
 from lt_lib.pixels.episodes import draw_scenes
 from lt_lib.settings.pixels import BankConfig
 from lt_lib.settings.streams import Stream
@@ -22,15 +22,16 @@ def perfect_bank(layout: str, draws: int) -> dict:
 
     Executors are trained in the paper's layout alone; in others, what matters here is what the message says.
     """
-    scenes = draw_scenes(load_layout(layout), draws, Stream.BANK.generator(0, layout))
-    free = np.broadcast_to(~np.eye(len(SIDES), dtype=bool), (draws, len(SIDES), len(SIDES)))  # (draws, slab, route)
-    nothing, both = np.zeros(free.shape, np.int64), np.broadcast_to(np.arange(len(SIDES)), free.shape)
+    arena = load_layout(layout)
+    scenes = draw_scenes(arena, draws, Stream.BANK.generator(0, layout))
+    free = np.broadcast_to(~arena.blocks, (draws, *arena.blocks.shape))  # (draws, slab, route)
+    nothing, taken = np.zeros(free.shape, np.int64), np.broadcast_to(np.arange(free.shape[2]), free.shape)
     default = BankConfig()
     return scenes._asdict() | {
         "success": free.copy(),
         "length": nothing,
         "contacts": nothing,
-        "entered": both.copy(),
+        "entered": taken.copy(),
         "commit_step": default.commit_step,
         "held_out": default.held_out,
     }

@@ -1,0 +1,219 @@
+"""Richer decisions: arenas of several corridors, what one bit can tell, and one broadcast for many receivers."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from lt_lib.beyond.corridors import COUNTS, corridor_layout
+from lt_lib.beyond.deciders import HAND, MESSAGES, train_deciders
+from lt_lib.beyond.decisions import DecisionProtocol, ceiling
+from lt_lib.beyond.layouts import written
+from lt_lib.beyond.rich import DEPTHS, MAT, RichScenes, draw_rich_scenes, mats, rich_layout
+from lt_lib.beyond.tasks import TASKS
+from lt_lib.beyond.variance import perfect_bank
+from lt_lib.comm.messages import CONTENTS, Sender
+from lt_lib.envs.arena import Arena
+from lt_lib.envs.camera import FastCamera
+from lt_lib.envs.layout import NO_CORRIDOR, load_layout
+from lt_lib.envs.materials import HAZARD
+from lt_lib.envs.occlusion import occlusion, require_occlusion
+from lt_lib.envs.reference import ReferenceCamera
+from lt_lib.perception.frames import free_poses
+from lt_lib.perception.jepa import train_encoder
+from lt_lib.pixels.executor import Executor, FrozenExecutor, train_executor
+from lt_lib.pixels.route import drawn, read_head, train_head
+from lt_lib.settings.base import LAYOUTS, UserError
+from lt_lib.settings.beyond import DeciderConfig
+from lt_lib.settings.perception import EncoderConfig
+from lt_lib.settings.pixels import ExecutorConfig, HeadConfig
+from lt_lib.settings.profiles import SECTIONS, validated
+
+
+def quiet(_: float) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def four():
+    return load_layout("corridors_4")
+
+
+@pytest.fixture(scope="module")
+def untrained():
+    return train_encoder(EncoderConfig(frames=640, epochs=0.0), 0, report=quiet)
+
+
+# --- arenas
+@pytest.mark.parametrize("count", COUNTS)
+def test_the_arenas_are_the_generator_s_and_show_every_slab_to_the_scout_alone(count):
+    layout = corridor_layout(count)
+    assert (LAYOUTS / f"corridors_{count}.yaml").read_text() == written(layout)
+    one = layout.model_copy(update={"blocked": "one"})
+    seen = occlusion(one, FastCamera(one, 256))
+    assert seen.navigator.shape == (count, count) and not seen.navigator.any()
+    assert (seen.scout > 0).all() and len(layout.placements) == count
+
+
+def test_all_but_one_corridor_is_blocked(four):
+    assert four.placements == ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+    np.testing.assert_array_equal(four.blocks, ~np.eye(4, dtype=bool))
+    assert load_layout("default").placements == ((0,), (1,))
+    mouths = [corridor.legs[0] for corridor in four.routes]
+    x, y = np.array([[leg.x[0] + 0.1, sum(leg.y) / 2] for leg in mouths] + [[-3.0, 0.0]]).T
+    np.testing.assert_array_equal(four.corridor_at(x, y), [0, 1, 2, 3, NO_CORRIDOR])
+
+
+def test_several_slabs_are_drawn_as_mujoco_draws_them(four):
+    rng, n = np.random.default_rng(0), 60
+    slab = rng.integers(0, 4, n)
+    other = free_poses(four, slab, rng)
+    pose = free_poses(four, slab, rng, apart_from=other)
+    fast, slow = (camera.frames(pose, slab, other[:, :2]) for camera in (FastCamera(four), ReferenceCamera(four)))
+    assert (fast == slow).mean() > 0.998
+    assert (HAZARD[fast].any((1, 2)) == HAZARD[slow].any((1, 2))).mean() > 0.98
+
+
+def test_the_slabs_of_a_placement_are_solid_and_the_free_corridor_is_free(four):
+    """A robot that pushes against every exit from beyond the barrier enters the free corridor alone."""
+    arena, count = Arena(four, 16), 4
+    slab, corridor = np.repeat(np.arange(count), count), np.tile(np.arange(count), count)
+    pose = np.zeros((16, 3))
+    pose[:, 0] = four.barrier[1] + 0.6
+    pose[:, 1] = [sum(four.routes[side].slab.y) / 2 for side in corridor]
+    pose[:, 2] = np.pi
+    arena.reset(np.ones(16, bool), pose, slab, np.tile(four.scout.array, (16, 1)))
+    for _ in range(15):
+        arena.step(np.tile([1.0, 0.0, 0.0], (16, 1)))
+    np.testing.assert_array_equal(arena.corridor == corridor, slab == corridor)
+    np.testing.assert_array_equal(arena.contact, slab != corridor)
+
+
+def test_an_arena_in_which_the_navigator_sees_a_slab_is_refused(four):
+    beyond = tuple(point.model_copy(update={"x": 3.0, "heading": 180.0}) for point in four.choice_points)
+    bare = four.model_copy(update={"choice_points": beyond})
+    with pytest.raises(UserError, match="the navigator sees the 1 slab") as error:
+        require_occlusion(bare)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("corridors", [[2, 5], [4], ["2", 4]])
+def test_impossible_numbers_of_corridors_are_refused_in_one_line(corridors):
+    with pytest.raises(UserError, match="corridors") as error:
+        validated(SECTIONS["corridors"], "corridors", corridors)
+    assert "\n" not in str(error.value)
+    with pytest.raises(UserError, match="no arena with 5"):
+        DecisionProtocol.of([2, 5], {"executor": {"steps": 2}}, "cpu", 1)
+
+
+def test_an_executor_has_a_command_per_corridor(untrained):
+    config = ExecutorConfig(layout="corridors_3", steps=256, envs=4, rollout=32)
+    weights = train_executor(config, 0, report=quiet, encoder=untrained)
+    driver = FrozenExecutor(weights)
+    assert driver.routes == 3
+    actions = driver.mean_action(torch.zeros(3, 64), np.arange(3))
+    assert actions.shape == (3, 3) and len({tuple(row) for row in actions.round(6)}) == 3
+    assert Executor(3).mean[0].weight.shape[1] == 67
+
+
+# --- what a bit can tell
+def test_routes_are_drawn_with_their_probabilities():
+    shares = np.tile([0.1, 0.2, 0.3, 0.4], (20_000, 1))
+    counts = np.bincount(drawn(shares, np.random.default_rng(0)), minlength=4) / 20_000
+    np.testing.assert_allclose(counts, shares[0], atol=0.015)
+    two = np.random.default_rng(1).dirichlet([1, 1], 500)
+    expected = np.random.default_rng(2).random(500) < two[:, 1]
+    np.testing.assert_array_equal(drawn(two, np.random.default_rng(2)), expected)
+
+
+@pytest.mark.parametrize(("name", "bits"), [("corridors_3", 0), ("corridors_3", 1), ("corridors_4", 1), ("default", 1)])
+def test_the_ceiling_is_the_best_of_all_senders_and_readers(name, bits):
+    blocks = load_layout(name).blocks
+    routes, best = blocks.shape[1], 0.0
+    for reader in product(range(routes), repeat=2**bits):  # a route for each value of the message
+        right = ~blocks[:, list(reader)]  # (placements, values): the sender takes a value that is right, if one is
+        best = max(best, right.any(axis=1).mean())
+    assert ceiling(blocks, bits) == pytest.approx(best)
+    assert ceiling(blocks, 5) == 1
+
+
+@pytest.mark.parametrize(("content", "passes"), [("half", False), ("floor", False), ("state", True)])
+def test_no_head_passes_the_ceiling_of_one_bit_unless_the_wire_leaks_more(content, passes, untrained):
+    bank = perfect_bank("corridors_4", 64)
+    config = HeadConfig(layout="corridors_4", content=content, episodes=6_000, minibatch=128)
+    result = train_head(config, 0, report=quiet, bank=bank, encoder=untrained)
+    share = result["optimal"][-500:].mean()
+    assert (share > ceiling(load_layout("corridors_4").blocks, 1) + 0.06) == passes
+    assert set(result["route"]) <= set(range(4)) and read_head(result).logits.out_features == 4
+
+
+def test_messages_by_hand_say_what_they_claim(four):
+    sender = Sender(four, None, np.zeros((4, 64, 64), np.uint8), np.zeros((4, 3)), np.zeros((4, 2)), np.arange(4))
+    assert CONTENTS["half"](sender)[:, 0].tolist() == [1, 1, 0, 0]
+    assert CONTENTS["state"](sender)[:, :2].tolist() == [[0, 0], [1, 0], [0, 1], [1, 1]]
+    assert not CONTENTS["state"](sender)[:, 2:].any() and not CONTENTS["half"](sender)[:, 1:].any()
+
+
+# --- one broadcast, many receivers
+@pytest.fixture(scope="module")
+def scenes() -> RichScenes:
+    return draw_rich_scenes(rich_layout("default"), 600, np.random.default_rng(0))
+
+
+def test_everything_in_a_scene_is_independent_of_everything_else(scenes):
+    facts = np.column_stack([scenes.slab, scenes.depth, scenes.goal, scenes.company, scenes.detour])
+    correlations = np.corrcoef(facts.T) - np.eye(5)
+    assert np.abs(correlations).max() < 0.15
+    assert scenes.depth.min() >= DEPTHS[0] and scenes.depth.max() <= DEPTHS[1]
+
+
+def test_a_deeper_mat_shows_more_red_and_stands_before_its_own_exit(scenes):
+    layout = rich_layout("default")
+    assert layout.slab_height == MAT
+    x0, x1, y0, y1 = mats(layout, scenes.slab, scenes.depth)[:, 0].T
+    np.testing.assert_allclose(x1 - x0, scenes.depth)
+    assert ((y0 > 0) == (scenes.slab == 0)).all() and (y1 - y0 > 0.5).all()
+    red = (scenes.pictures[..., 0] > 150) & (scenes.pictures[..., 1] < 100)
+    deep, flat = (red[pick].sum((1, 2)).mean() for pick in (scenes.depth > 1.2, scenes.depth < 0.4))
+    assert deep > 1.5 * flat > 0
+
+
+@pytest.mark.parametrize("task", HAND, ids=lambda task: task.words)
+def test_a_message_by_hand_decides_its_own_task(task, scenes):
+    best = task.reward(scenes).argmax(axis=1)
+    codes = task.bits(scenes) @ 2.0 ** np.arange(task.bits(scenes).shape[1])
+    assert all(len(set(best[codes == code])) == 1 for code in set(codes)) and len(set(best)) > 1
+
+
+def test_through_or_round_depends_on_the_receiver_s_own_detour(scenes):
+    task = TASKS["through or round"]
+    np.testing.assert_array_equal(task.reward(scenes).argmax(axis=1), (scenes.detour < scenes.depth).astype(int))
+    np.testing.assert_array_equal(task.own(scenes)[:, 0], scenes.detour)
+
+
+@pytest.mark.parametrize(
+    ("task", "message", "low", "high"),
+    [
+        ("which goal", "'which goal' by hand", 0.95, 1.0),
+        ("which goal", "nothing", 0.2, 0.45),
+        ("is the side clear", "'which goal' by hand", 0.4, 0.6),
+        ("which corridor", "latent", 0.8, 1.0),
+    ],
+)
+def test_heads_learn_what_the_message_holds_and_nothing_else(task, message, low, high, untrained):
+    sender = {name: value for name, value in untrained.items() if name.startswith("E.") or name in ("mean", "std")}
+    config = DeciderConfig(task=task, message=message, scenes=2_048, episodes=6_000, heads=1)
+    found = train_deciders(config, 0, report=quiet, sender=sender)
+    assert low <= found["reward"].mean() <= high
+    assert found["course"].shape == (1, 6_000) and found["reward"].shape == (1, 256)
+
+
+def test_every_message_has_a_width_that_fits(scenes):
+    few = scenes.take(slice(3))
+
+    class Sixty:
+        def latents(self, pictures):
+            return np.zeros((len(pictures), 64))
+
+    assert all(MESSAGES[name](few, Sixty()).shape[1] <= 64 for name in MESSAGES)
