@@ -138,6 +138,19 @@ config = ReaderConfig(sender="thumbnail", episodes=2000, heads=1)
 read = train_readers(config, 0, report=quiet, bank=perfect_bank("default", 128), sender=sender)
 assert read["greedy"].mean() > 0.95
 """,
+    "task": """
+from lt_lib.beyond.deciders import MESSAGES, train_deciders
+from lt_lib.settings.beyond import DeciderConfig
+from lt_lib.perception.jepa import train_encoder
+from lt_lib.settings.perception import EncoderConfig
+quiet = lambda _: None
+blank = train_encoder(EncoderConfig(frames=640, epochs=0.0), 0, report=quiet)
+sender = {name: value for name, value in blank.items() if name[:2] == "E." or name in ("mean", "std")}
+def learned(message):
+    config = DeciderConfig(task="same side", message=message, scenes=2048, heads=1)
+    return train_deciders(config, 0, report=quiet, sender=sender)["reward"].mean()
+assert learned("'same side' by hand") > 0.95 > 0.8 > learned("nothing")
+""",
 }
 
 
