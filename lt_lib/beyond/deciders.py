@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from lt_lib.comm.route_head import RouteHead
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.pictures import PictureEncoder
 from lt_lib.pixels.protocol import SEED, PixelProtocol
-from lt_lib.pixels.route import drawn
+from lt_lib.pixels.route import Chooser, drawn
 from lt_lib.settings.beyond import DeciderConfig, DeciderSizes
 from lt_lib.settings.profiles import validated
 from lt_lib.settings.streams import Stream
@@ -57,7 +58,9 @@ def train_deciders(
     found, courses = [], []
     for head in range(config.heads):
         rng = Stream.READER.generator(head, config.task, config.message)
-        network, course = learned(config, wires[cut:], rewards[cut:], rng)
+        network, course = learned(
+            config, partial(RouteHead, wires.shape[1], rewards.shape[1]), wires[cut:], rewards[cut:], rng
+        )
         with torch.no_grad():
             greedy = network.policy(wires[:cut]).logits.argmax(1).numpy()
         found.append(rewards[np.arange(cut), greedy])
@@ -82,12 +85,16 @@ def wired(
 
 
 def learned(
-    config: DeciderConfig, wires: Float[Tensor, "n w"], rewards: Float[np.ndarray, "n a"], rng: np.random.Generator
-) -> tuple[RouteHead, Float[np.ndarray, " episodes"]]:
+    config: DeciderSizes,
+    network: Callable[[], Chooser],
+    wires: Float[Tensor, "n w"],
+    rewards: Float[np.ndarray, "n a"],
+    rng: np.random.Generator,
+) -> tuple[Chooser, Float[np.ndarray, " episodes"]]:
     """A head trained by the reward of its sampled actions alone, and that reward, episode by episode."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
-        head = RouteHead(wires.shape[1], rewards.shape[1])
+        head = network()
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     course = []
     for start in range(0, config.episodes, config.batch):

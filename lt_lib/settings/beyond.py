@@ -2,9 +2,9 @@
 
 from typing import Annotated
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from lt_lib.settings.base import Settings, Share, Training
+from lt_lib.settings.base import LATENCY, Settings, Share, Training
 from lt_lib.settings.gridworld import GridConfig, PatchEncoderConfig
 from lt_lib.settings.perception import PictureConfig
 from lt_lib.settings.pixels import HeadConfig
@@ -83,6 +83,26 @@ class DeciderConfig(DeciderSizes, Training):
     decided = (*Training.decided, "task", "message")
     task: str  # a name in beyond.tasks.TASKS
     message: str  # a name in beyond.deciders.MESSAGES
+
+
+class MovingSizes(DeciderSizes):
+    """Scouts that drive, and heads that read their messages."""
+
+    scenes: Annotated[int, Field(ge=16)] = 4_096
+    every: PositiveInt = 4  # control steps between messages
+    commit_step: PositiveInt = 40  # control steps that the navigator waits
+    errands: Share = 0.0  # probability that a scout drives to the goal through the free corridor; else it patrols
+    watching: Share = 1.0  # probability that a patrol faces the barrier on its way to a place
+    scouts: PositiveInt = 1
+
+
+class MovingConfig(MovingSizes, Training):
+    """One content from scouts that drive."""
+
+    decided = (*Training.decided, "content", "wire", "latency")
+    content: str  # names in comm.messages.CONTENTS, joined by ' and '
+    wire: str = "intact"  # a name in comm.channel.WIRES
+    latency: NonNegativeInt = LATENCY  # control steps
 
 
 class PatchSenderConfig(PatchEncoderConfig):
