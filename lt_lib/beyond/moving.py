@@ -5,7 +5,8 @@ later, with the sender's place at sending relative to the navigator's. The recei
 """
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,8 +24,12 @@ from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import SIDES, Layout, load_layout
 from lt_lib.envs.materials import HAZARD
 from lt_lib.perception.encoder import FrozenEncoder
-from lt_lib.settings.beyond import MovingConfig
+from lt_lib.pixels.protocol import SEED, PixelProtocol
+from lt_lib.settings.beyond import MovingConfig, MovingSizes
+from lt_lib.settings.profiles import validated
 from lt_lib.settings.streams import Stream
+from lt_lib.store.run import Result, Run
+from lt_lib.store.states import only
 
 EGO, POOLED = 2, 64  # floats: the navigator's own place, and the pooled messages
 WIRE = ANCHOR + 2 * CONTENT  # the widest content is two side by side
@@ -108,14 +113,15 @@ def train_moving(
     "seeing"  (scenes,) share of the messages whose sender saw the slab;  "errand" (scenes,)
     """
     layout = load_layout(config.layout)
-    rng = Stream.LADDER.generator(seed, "moving", str(config.errands), str(config.watching), str(config.scouts))
+    case = [str(getattr(config, name)) for name in ("errands", "watching", "scouts", "commit_step")]
+    rng = Stream.LADDER.generator(seed, "moving", *case)  # contents share their episodes
     drives = draw_drives(layout, config, rng)
     observed, seeing = stream(layout, FrozenEncoder(encoder, config.device), config, drives, rng)
     rewards, cut = np.eye(len(SIDES))[1 - drives.slab], int(config.scenes * config.held_out)
     messages = (observed.shape[1] - EGO) // (WIRE + 1)
     greedy = []
     for head in range(config.heads):
-        own = Stream.READER.generator(head, "moving", config.content, config.wire, str(config.commit_step))
+        own = Stream.READER.generator(head, "moving", config.content, config.wire, *case)
         network, _ = learned(config, lambda: StreamHead(messages), observed[cut:], rewards[cut:], own)
         with torch.no_grad():
             greedy.append(network.policy(observed[:cut]).logits.argmax(1).numpy() != drives.slab[:cut])
@@ -137,3 +143,40 @@ def _content(
 
 def _corrupted(config: MovingConfig, rng: np.random.Generator) -> Callable[[Tensor], Tensor]:
     return lambda wire: WIRES[config.wire](wire, rng)
+
+
+@dataclass(frozen=True)
+class MovingProtocol:
+    """Heads behind the paper's frozen encoder, one case after another."""
+
+    sizes: MovingSizes
+    pixels: PixelProtocol
+
+    @classmethod
+    def of(
+        cls,
+        moving: Mapping[str, Any],
+        broadcast: Mapping[str, Any],
+        layout: str,
+        device: str,
+        workers: int | str,
+        weights: str,
+    ) -> "MovingProtocol":
+        """From a notebook's parameters. Raises UserError for unusable ones."""
+        sizes = validated(MovingSizes, "moving", dict(moving))
+        return cls(sizes, PixelProtocol.of(broadcast, layout, device, workers, weights))
+
+    def read(self, cases: Mapping[Any, Mapping[str, Any]], what: str) -> dict[Any, Result]:
+        """What heads make of each case, by the name of the case; a case changes settings of `MovingConfig`."""
+        encoder = self.pixels.encoder_weights()
+        weights = only(encoder, "E") | only(encoder, "P") | {name: encoder[name] for name in ("mean", "std")}
+        shared = self.sizes.model_dump() | {
+            "layout": self.pixels.layout,
+            "device": self.pixels.sizes.encoder.device,
+            "latency": self.pixels.sizes.latency,
+        }
+        runs = [
+            Run(train_moving, MovingConfig(**shared | dict(case)), SEED, {"encoder": weights})
+            for case in cases.values()
+        ]
+        return dict(zip(cases, self.pixels.store.fetch(runs, what), strict=True))

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
-from lt_lib.settings.base import ROOT, UserError, refuse_decided, require_known
-from lt_lib.settings.beyond import ControlsConfig, DeciderSizes, Rung
+from lt_lib.settings.base import ROOT, Share, UserError, refuse_decided, require_known
+from lt_lib.settings.beyond import ControlsConfig, DeciderSizes, MovingSizes, Rung
 from lt_lib.settings.gridworld import GridworldConfig, Scaled
 from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, RailsConfig, SessionsConfig
 from lt_lib.settings.learnability import Budget, PointMassConfig
@@ -203,5 +203,10 @@ SECTIONS: dict[str, Any] = {
     "message_seeds": dict[str, PositiveInt],
     "broadcast": PixelsConfig,
     "decider": DeciderSizes,
+    "moving": MovingSizes,
+    "errand_shares": Annotated[list[Share], Field(min_length=2)],
+    "watchings": Annotated[list[Share], Field(min_length=2)],
+    "commit_steps": Annotated[list[PositiveInt], Field(min_length=2)],
+    "scout_counts": Annotated[list[PositiveInt], Field(min_length=2)],
     "rungs": Annotated[list[Rung], Field(min_length=1)],
 }
