@@ -160,7 +160,12 @@ def test_the_autoencoder_learns_to_rebuild_what_it_sees():
     result = trained("autoencoder", epochs=10.0, lr=3e-3, batch=32)
     assert result["loss"][-1] < result["loss"][0] / 4
     model, pictures = senders.Autoencoder(), torch.rand(2, 64, 64, 3)
-    assert model(pictures).shape == pictures.shape
+    rebuilt = model.decoder(model.encoder(pictures)).detach().numpy()
+    errors = [
+        (rebuilt[n, c, i, j] - pictures[n, 4 * i : 4 * i + 4, 4 * j : 4 * j + 4, c].mean().item()) ** 2
+        for n, c, i, j in np.ndindex(rebuilt.shape)
+    ]
+    assert rebuilt.shape == (2, 3, 16, 16) and model.loss(pictures).item() == pytest.approx(np.mean(errors), rel=1e-4)
 
 
 def test_silence_says_the_same_of_every_picture():

@@ -20,6 +20,7 @@ from lt_lib.gridworld.protocol import GridProtocol
 from lt_lib.perception.gates import Measured
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import save_frozen
+from lt_lib.pixels.executor import train_executor
 from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.settings.base import everywhere, require_known
 from lt_lib.settings.beyond import (
@@ -70,6 +71,14 @@ class ControlProtocol:
         ours = [] if self.pixels.weights else [Run(train_encoder, self.pixels.sizes.encoder, SEED)]
         plain = self._runs([name for name in SENDERS if name != PAPER_S], self.sizes.sender)
         self.store.fetch([*ours, *plain.values(), *self._runs(RETRAINED, self._recoloured).values()], "senders")
+
+    def train_beside_executor(self, encoder: Result) -> None:
+        """Trains the executor, which takes one core for minutes, and beside it what else needs no bank."""
+        driver = (
+            [] if self.pixels.weights else [Run(train_executor, self.pixels.sizes.executor, SEED, {"encoder": encoder})]
+        )
+        others = [*self._layout_encoders().values(), *self._patch_senders().values()]
+        self.store.fetch([*driver, *others], "executor, and encoders of other scenes")
 
     def senders(self, encoder: Result) -> dict[str, list[Result]]:
         """Every frozen sender by name, several of those that are drawn; the JEPA sender is the paper's encoder.
@@ -150,13 +159,7 @@ class ControlProtocol:
 
     def varied(self, rung: Rung) -> np.ndarray:
         """Route optimality (layouts, encoders, heads) on one rung of JEPA encoders trained in other arenas."""
-        sizes = self.sizes.variance
-        trained = self.sizes.sender.model_copy(update={"frames": sizes.frames})
-        encoders = {
-            (layout, seed): Run(train_encoder, _plain(trained, layout), seed)
-            for layout in sizes.layouts
-            for seed in range(sizes.encoders)
-        }
+        sizes, encoders = self.sizes.variance, self._layout_encoders()
         trained_there = self.store.fetch(list(encoders.values()), "encoders of layouts")
         reading = self._reading() | {"heads": sizes.heads, "repeats": 1}
         runs = [
@@ -171,15 +174,27 @@ class ControlProtocol:
         greedy = [result["greedy"].mean(axis=1) for result in self.store.fetch(runs, "readers in other layouts")]
         return np.reshape(greedy, (len(sizes.layouts), sizes.encoders, sizes.heads))
 
+    def _layout_encoders(self) -> dict[tuple[str, int], Run]:
+        sizes = self.sizes.variance
+        trained = self.sizes.sender.model_copy(update={"frames": sizes.frames})
+        return {
+            (layout, seed): Run(train_encoder, _plain(trained, layout), seed)
+            for layout in sizes.layouts
+            for seed in range(sizes.encoders)
+        }
+
+    def _patch_senders(self) -> dict[str, Run]:
+        shared = {name: getattr(self.grid.encoder, name) for name in ("layout", "frames", "rollout", "epochs")}
+        return {
+            name: Run(sender.train, PatchSenderConfig(kind=name, **shared | dict(sender.changes)), SEED)
+            for name, sender in GRID_SENDERS.items()
+        }
+
     def twin(self) -> dict[str, list[Result]]:
         """Receivers of the gridworld that read each sender there, and one that learns with its sender."""
         grid, encoder = self.grid, self.grid.encoder_weights()
-        shared = {name: getattr(grid.encoder, name) for name in ("layout", "frames", "rollout", "epochs")}
-        trainings = [
-            Run(sender.train, PatchSenderConfig(kind=name, **shared | dict(sender.changes)), SEED)
-            for name, sender in GRID_SENDERS.items()
-        ]
-        senders = dict(zip(GRID_SENDERS, self.store.fetch(trainings, "patch senders"), strict=True))
+        trained = self.store.fetch(list(self._patch_senders().values()), "patch senders")
+        senders = dict(zip(GRID_SENDERS, trained, strict=True))
         eyes, policy = {"encoder": grid.frozen(encoder)}, grid.grid.model_dump(exclude={"layout_digest"})
         runs = {
             (name, seed): Run(

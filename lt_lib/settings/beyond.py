@@ -136,7 +136,7 @@ class ControlsConfig(Settings):
 
     sender: SenderConfig = SenderConfig()
     gates: SenderGateConfig = SenderGateConfig()
-    recoloured: SenderConfig = SenderConfig(frames=102_400)  # the second training, on frames in random colours
+    recoloured: SenderConfig = SenderConfig(frames=51_200)  # the second training, on frames in random colours
     colour: Share = 1.0  # of floor's and walls' colour that a random one replaces there
     drawn: PositiveInt = 3  # untrained encoders, and random projections
     repeats: PositiveInt = 2  # scenes per draw of the bank
