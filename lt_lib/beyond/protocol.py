@@ -74,11 +74,9 @@ class ControlProtocol:
 
     def train_beside_executor(self, encoder: Result) -> None:
         """Trains the executor, which takes one core for minutes, and beside it what else needs no bank."""
-        driver = (
-            [] if self.pixels.weights else [Run(train_executor, self.pixels.sizes.executor, SEED, {"encoder": encoder})]
-        )
+        driver = Run(train_executor, self.pixels.sizes.executor, SEED, {"encoder": encoder})
         others = [*self._layout_encoders().values(), *self._patch_senders().values()]
-        self.store.fetch([*driver, *others], "executor, and encoders of other scenes")
+        self.store.fetch(others if self.pixels.weights else [driver, *others], "executor, and encoders of other scenes")
 
     def senders(self, encoder: Result) -> dict[str, list[Result]]:
         """Every frozen sender by name, several of those that are drawn; the JEPA sender is the paper's encoder.

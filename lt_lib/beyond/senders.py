@@ -88,7 +88,7 @@ def projection(
 
 
 class Autoencoder(nn.Module):
-    """The encoder, and a decoder to the picture's means over 4 x 4 pixels: as fine as the paper's auxiliary read-out."""
+    """The encoder, and a decoder to means over 4 x 4 pixels, as fine as the paper's auxiliary read-out."""
 
     def __init__(self):
         super().__init__()
