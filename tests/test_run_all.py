@@ -80,6 +80,10 @@ def test_a_bad_profile_is_one_line_and_nothing_is_computed(project, capfd, yaml,
             ["--profile", "smoke", "--scheduler", "localhost"],
             "expected a scheduler's address such as tcp://127.0.0.1:8786, got 'localhost'",
         ),
+        (
+            ["--profile", "smoke", "--beyond", "--only", "02"],
+            "argument --beyond: --only names notebooks of either kind",
+        ),
         (["--profile", "smoke", "--fast"], "unrecognized arguments: --fast"),
         (["--profile", "smoke", "--outputs", "requirements.txt/out"], "cannot write in the folder "),
     ],
@@ -235,6 +239,17 @@ def test_a_scoreboard_is_summed_up_in_the_last_line(project, capfd):
     report = (project / "outputs" / "smoke" / "report" / "index.html").read_text()
     assert 'href="09_scoreboard.html"' in report and "profile smoke" in report
     assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: Of 3 claims: 2 reproduced, 1 not run."
+
+
+def test_what_is_beyond_the_paper_runs_on_demand_alone(project, capfd):
+    write_notebook(project, "11_controls", COMPUTE, WRITE)
+    assert smoke(project) == 0
+    manifest = project / "outputs" / "smoke" / "manifest.json"
+    assert "11_controls" not in json.loads(manifest.read_text())["notebooks"]
+    before = {path: path.stat().st_mtime_ns for path in (project / "outputs/smoke/results").iterdir()}
+    assert smoke(project, "--beyond") == 0
+    assert json.loads(manifest.read_text())["notebooks"]["11_controls"]["status"] == "ok"
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
 
 
 def test_a_failed_notebook_is_named_with_cell_and_log_and_others_still_run(project, capfd):
