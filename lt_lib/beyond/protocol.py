@@ -38,7 +38,7 @@ from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore, fetch_by_name
 from lt_lib.store.states import only
 
-PAPER_S, END_TO_END = "jepa", "end_to_end"
+PAPER_S, END_TO_END, SILENT = "jepa", "end_to_end", "silence"
 DRAWN = ("untrained", "random")  # senders of which there are several, since nothing but their seed makes them
 RETRAINED = ("jepa", "contrastive", "autoencoder", "pca", "supervised")  # also trained on frames in random colours
 # Rungs that a prediction speaks of
@@ -117,14 +117,15 @@ class ControlProtocol:
         }
         return fetch_by_name(self.store.fetch, runs, "gates of senders")
 
-    def save(
-        self, senders: Mapping[str, list[Result]], reports: Mapping[str, list[Result]], folder: Path, suffix: str = ""
-    ) -> None:
-        """Saves the first sender of every name as sender_<name><suffix>, its gates' measures beside it."""
+    def save(self, senders: Mapping[str, list[Result]], reports: Mapping[str, list[Result]], folder: Path) -> None:
+        """Saves senders that were trained as sender_<name>, their gates' measures beside them.
+
+        What nothing but a seed makes is made again by its function, and the paper's encoder has a file of its own.
+        """
         layout = load_layout(self.pixels.layout)
-        for name, (sender, *_) in senders.items():
+        for name in [name for name in senders if name not in (*DRAWN, SILENT, PAPER_S)]:
             facts = {"gates": {field: reports[name][0][field] for field in Measured._fields}}
-            save_frozen(folder, f"sender_{name}{suffix}", sender, layout, facts)
+            save_frozen(folder, f"sender_{name}", senders[name][0], layout, facts)
 
     def read(self, senders: Mapping[str, list[Result]], rungs: Sequence[Rung], bank: Result) -> Heads:
         """Heads that read each sender on each rung; one result per sender of a name."""
