@@ -39,6 +39,11 @@ class DecisionProtocol:
     def store(self) -> RunStore:
         return next(iter(self.protocols.values())).store
 
+    @property
+    def episodes(self) -> int:
+        """Of a head's training."""
+        return next(iter(self.protocols.values())).sizes.head.episodes
+
     def encoders(self) -> dict[int, dict[str, Result]]:
         """Per number of corridors, the paper's encoder trained in that arena, and an untrained one."""
         runs = {

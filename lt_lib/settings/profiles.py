@@ -200,6 +200,7 @@ SECTIONS: dict[str, Any] = {
     "device": Literal["auto", "cpu", "cuda"],
     "controls": ControlsConfig,
     "corridors": Annotated[list[Literal[2, 3, 4, 6]], Field(min_length=2)],  # those of beyond.corridors.COUNTS
+    "early": PositiveInt,
     "message_seeds": dict[str, PositiveInt],
     "broadcast": PixelsConfig,
     "decider": DeciderSizes,
