@@ -156,7 +156,7 @@ def test_weights_that_are_not_what_they_should_be_are_refused_in_one_line(traine
 def test_preflight_refuses_what_the_notebooks_would_only_find_later(tmp_path):
     check_inputs({"layout": "default", "weights": "", "seeds": {"latent": 2}})
     for inputs, complaint in (
-        ({"layout": "maze"}, "unknown layout 'maze'; known: default"),
+        ({"layout": "maze"}, "unknown layout 'maze'; known: corridors_2"),
         ({"layout": "leaking"}, "the navigator sees the"),
         ({"layout": "default", "weights": str(tmp_path)}, "encoder.safetensors is missing"),
         ({"seeds": {"smoke signals": 2}}, "unknown message condition 'smoke signals'; known: latent"),

@@ -81,7 +81,7 @@ def test_every_row_is_judged_by_the_function_that_its_counterexample_refutes(und
     judges = {name: getattr(case[0], "func", case[0]).__name__ for name, case in CASES.items()}
     found = {}
     for path in (undisturbed / "results").glob("*.json"):
-        found |= json.loads(path.read_text())["findings"]
+        found |= json.loads(path.read_text()).get("findings", {})  # what is beyond the paper has predictions
     open_ = {"grid.peek_length"}  # added beside its judge's result where no policy peeks
     judged = {name: found[name]["judge"] for name in judges if name in found and name not in open_}
     assert judged == {name: judges[name] for name in judged} and len(judged) > 80
