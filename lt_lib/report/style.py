@@ -1,5 +1,6 @@
 """What all figures share: colours by role, the stamp of sizes that give no results, and the folder."""
 
+import re
 from pathlib import Path
 from textwrap import fill
 
@@ -30,6 +31,11 @@ def chance_line(axes: Axes, level: float = 0.5) -> None:
 def wrapped(words: str) -> str:
     """A tick's words in lines that do not reach the next tick's."""
     return fill(words, 15, break_long_words=False)
+
+
+def plain(words: str) -> str:
+    """A label's words without the marks of its formulas, for tables: 'latent z_t'."""
+    return re.sub(r"[${}]", "", words.replace(r"\hat{z}", "ẑ"))
 
 
 def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str) -> Image:
