@@ -127,7 +127,7 @@ def test_routes_are_drawn_with_their_probabilities():
     np.testing.assert_array_equal(drawn(two, np.random.default_rng(2)), expected)
 
 
-@pytest.mark.parametrize(("name", "bits"), [("corridors_3", 0), ("corridors_3", 1), ("corridors_4", 1), ("default", 1)])
+@pytest.mark.parametrize(("name", "bits"), [("corridors_3", 0), ("corridors_3", 1), ("corridors_6", 2), ("default", 1)])
 def test_the_ceiling_is_the_best_of_all_senders_and_readers(name, bits):
     blocks = load_layout(name).blocks
     routes, best = blocks.shape[1], 0.0
