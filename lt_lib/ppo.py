@@ -3,8 +3,8 @@
 Clip 0.2, four epochs, entropy coefficient 0.01, gamma 0.99, lambda 0.95, the same for every seed and condition.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from lt_lib.settings.ppo import PpoConfig
 
+Module = TypeVar("Module", bound=nn.Module)
 MAX_GRADIENT_NORM = 0.5
 VALUE_COEFFICIENT = 0.5
 
@@ -57,6 +58,13 @@ class Step(NamedTuple):
     rewards: Float[Tensor, " n"]
     terminated: Bool[Tensor, " n"]
     ended: Bool[Tensor, " n"]
+
+
+def built(make: Callable[[], Module], rng: np.random.Generator) -> Module:
+    """What `make` makes, its weights drawn from a generator and not from torch's global one."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(rng.integers(2**31)))
+        return make()
 
 
 def mlp(inputs: int, outputs: int, gain: float, hidden: int = 128) -> nn.Sequential:

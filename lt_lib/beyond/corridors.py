@@ -8,10 +8,9 @@ their number, so that the scout still sees every slab. One corridor is free, the
 
 import numpy as np
 
-from lt_lib.beyond.layouts import written
+from lt_lib.beyond.layouts import cm, rect, write
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.envs.occlusion import require_occlusion
-from lt_lib.settings.base import LAYOUTS
 
 COUNTS = (2, 3, 4, 6)
 PITCH, OFFSET, HALF = 1.7, 0.95, 0.3  # metres: between corridors, from mouth to exit, half a corridor's width
@@ -35,11 +34,11 @@ def corridor_layout(count: int) -> Layout:
         | {
             "name": f"corridors_{count}",
             "blocked": "all but one",
-            "arena": {"x": [values["arena"]["x"][0], _cm(scout + 3.0)], "y": [_cm(-outer), _cm(outer)]},
+            "arena": {"x": [values["arena"]["x"][0], cm(scout + 3.0)], "y": [cm(-outer), cm(outer)]},
             "corridors": [_corridor(near, far, mouth, out) for mouth, out in zip(mouths, exits, strict=True)],
-            "scout": values["scout"] | {"x": _cm(scout), "y": _cm(middle)},
-            "goal": values["goal"] | {"x": _cm(scout + 2.0), "y": _cm(middle)},
-            "choice_points": [{"x": _cm(near - 0.3), "y": _cm(mouth), "heading": 0.0} for mouth in mouths],
+            "scout": values["scout"] | {"x": cm(scout), "y": cm(middle)},
+            "goal": values["goal"] | {"x": cm(scout + 2.0), "y": cm(middle)},
+            "choice_points": [{"x": cm(near - 0.3), "y": cm(mouth), "heading": 0.0} for mouth in mouths],
         }
     )
     require_occlusion(layout)
@@ -52,17 +51,9 @@ def _corridor(near: float, far: float, mouth: float, out: float) -> dict:
         ((0.0, 0.6), (out - HALF, mouth + HALF)),
         ((0.0, far), (out - HALF, out + HALF)),
     ]
-    return {"legs": [_rect(x, y) for x, y in legs], "slab": _rect((far - HALF, far + HALF), (out - HALF, out + HALF))}
-
-
-def _rect(x: tuple[float, float], y: tuple[float, float]) -> dict:
-    return {"x": [_cm(value) for value in x], "y": [_cm(value) for value in y]}
-
-
-def _cm(value: float) -> float:
-    return round(float(value), 2)
+    return {"legs": [rect(x, y) for x, y in legs], "slab": rect((far - HALF, far + HALF), (out - HALF, out + HALF))}
 
 
 if __name__ == "__main__":
     for count in COUNTS:
-        (LAYOUTS / f"corridors_{count}.yaml").write_text(written(corridor_layout(count)), encoding="utf-8")
+        write(corridor_layout(count))

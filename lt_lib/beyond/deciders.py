@@ -12,21 +12,21 @@ from torch import Tensor
 
 from lt_lib import ppo
 from lt_lib.beyond.rich import RichScenes, draw_rich_scenes, rich_layout
+from lt_lib.beyond.senders import frozen
 from lt_lib.beyond.tasks import TASKS
 from lt_lib.beyond.tasks.depth import classes
 from lt_lib.beyond.tasks.task import binary
 from lt_lib.comm.channel import anchor
 from lt_lib.comm.messages import CONTENT
-from lt_lib.comm.route_head import RouteHead
+from lt_lib.comm.route_head import Chooser, RouteHead
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.pictures import PictureEncoder
 from lt_lib.pixels.protocol import SEED, PixelProtocol
-from lt_lib.pixels.route import Chooser, drawn
+from lt_lib.pixels.route import drawn
 from lt_lib.settings.beyond import DeciderConfig, DeciderSizes
 from lt_lib.settings.profiles import validated
 from lt_lib.settings.streams import Stream
 from lt_lib.store.run import Result, Run
-from lt_lib.store.states import only
 
 Content = Callable[[RichScenes, PictureEncoder], np.ndarray]
 HAND = [task for task in TASKS.values() if task.words != "through or round"]  # tasks whose bits one hand can list
@@ -92,9 +92,7 @@ def learned(
     rng: np.random.Generator,
 ) -> tuple[Chooser, Float[np.ndarray, " episodes"]]:
     """A head trained by the reward of its sampled actions alone, and that reward, episode by episode."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        head = network()
+    head = ppo.built(network, rng)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     course = []
     for start in range(0, config.episodes, config.batch):
@@ -143,13 +141,9 @@ class DeciderProtocol:
                 train_deciders,
                 DeciderConfig(task=task, message=message, **shared),
                 SEED,
-                {"sender": _sending(blank if message == "untrained" else ours)},
+                {"sender": frozen(blank if message == "untrained" else ours)},
             )
             for task in tasks
             for message in messages
         }
         return dict(zip(runs, store.fetch(list(runs.values()), "receivers"), strict=True))
-
-
-def _sending(encoder: Result) -> Result:
-    return only(encoder, "E") | {name: encoder[name] for name in ("mean", "std")}

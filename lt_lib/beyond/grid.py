@@ -13,7 +13,8 @@ from sklearn.decomposition import PCA
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lt_lib.beyond.senders import ALONE, cross_entropy_of_pairs
+from lt_lib import ppo
+from lt_lib.beyond.senders import ALONE, Contrasting, Judging, cross_entropy_of_pairs, filled
 from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.gridworld.map import CODES, PATCH, Grid
 from lt_lib.gridworld.mappo import Inputs, TableTeam, learn
@@ -72,40 +73,18 @@ def projection(
     matrix: Float[np.ndarray, "64 d"], bias: Float[np.ndarray, "64"], visits: Visits, seed: int
 ) -> dict[str, np.ndarray]:
     """A linear sender, frozen."""
-    network = PatchProjection()
-    with torch.no_grad():
-        network.linear.weight.copy_(torch.from_numpy(matrix))
-        network.linear.bias.copy_(torch.from_numpy(bias))
-    return frozen_on(network, visits, seed)
-
-
-class Judging(nn.Module):
-    """The patch encoder and one logit: whether the slab stands in the right corridor."""
-
-    def __init__(self):
-        super().__init__()
-        self.encoder, self.logit = PatchEncoder(), nn.Linear(LATENT, 1)
+    return frozen_on(filled(PatchProjection(), matrix, bias), visits, seed)
 
 
 def supervised(config: PatchSenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
     """The same encoder trained to name the blocked corridor."""
     visits = visits_of(config, seed)
-    table, slab = torch.from_numpy(visits.table), torch.from_numpy(visits.walk.slab).float()
+    table, slab = torch.from_numpy(visits.table), torch.from_numpy(visits.walk.slab)
 
     def terms(model: Judging, r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Float[Tensor, "1"]:
-        logits = model.logit(model.encoder(table[visits.rows[r, t]]))
-        return F.binary_cross_entropy_with_logits(logits, slab[r, None])[None]
+        return model.cross_entropy(table[visits.rows[r, t]], slab[r])
 
-    return trained(Judging, terms, visits, config, seed, report)
-
-
-class Contrasting(nn.Module):
-    """The patch encoder and the head on which the contrastive loss is taken."""
-
-    def __init__(self):
-        super().__init__()
-        self.encoder = PatchEncoder()
-        self.head = nn.Sequential(nn.ReLU(), nn.Linear(LATENT, 128), nn.ReLU(), nn.Linear(128, LATENT))
+    return trained(lambda: Judging(PatchEncoder()), terms, visits, config, seed, report)
 
 
 def contrastive(config: PatchSenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
@@ -118,11 +97,11 @@ def contrastive(config: PatchSenderConfig, seed: int, *, report: Callable[[float
         codes = [model.head(model.encoder(table[visits.rows[r, each]])) for each in (t, later)]
         return cross_entropy_of_pairs(*codes, config.temperature)[None]
 
-    return trained(Contrasting, terms, visits, config, seed, report)
+    return trained(lambda: Contrasting(PatchEncoder()), terms, visits, config, seed, report)
 
 
 def trained(
-    network: type[nn.Module],
+    network: Callable[[], nn.Module],
     terms: Callable[..., Tensor],
     visits: Visits,
     config: PatchSenderConfig,
@@ -145,11 +124,6 @@ def frozen_on(network: nn.Module, visits: Visits, seed: int) -> dict[str, np.nda
     return state_of(network, "E") | normalisation(network(seen).numpy())
 
 
-def paper_s(config: PatchSenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
-    """The paper's objective, with whatever weights its four terms have; without the first three, an autoencoder."""
-    return train_patch_encoder(config, seed, report=report)
-
-
 class GridSender(NamedTuple):
     """How a sender's patch encoder is trained, and the settings in which its training differs from the others'."""
 
@@ -157,15 +131,16 @@ class GridSender(NamedTuple):
     changes: Mapping[str, float]
 
 
+# The paper's objective without its first three terms is an autoencoder.
 GRID_SENDERS = {
-    "jepa": GridSender(paper_s, {}),
-    "no_reconstruction": GridSender(paper_s, {"reconstruction": 0.0}),
-    "prediction": GridSender(paper_s, ALONE),
+    "jepa": GridSender(train_patch_encoder, {}),
+    "no_reconstruction": GridSender(train_patch_encoder, {"reconstruction": 0.0}),
+    "prediction": GridSender(train_patch_encoder, ALONE),
     "contrastive": GridSender(contrastive, {}),
-    "autoencoder": GridSender(paper_s, {"prediction": 0.0, "variance": 0.0, "covariance": 0.0}),
+    "autoencoder": GridSender(train_patch_encoder, {"prediction": 0.0, "variance": 0.0, "covariance": 0.0}),
     "pca": GridSender(principal_components, {}),
     "random": GridSender(random_projection, {}),
-    "untrained": GridSender(paper_s, {"epochs": 0.0}),
+    "untrained": GridSender(train_patch_encoder, {"epochs": 0.0}),
     "supervised": GridSender(supervised, {}),
     "silence": GridSender(silence, {}),
 }
@@ -185,7 +160,7 @@ def train_grid_reader(
     sent = contents_sent(grid, cells(grid, sender), "latent")
     inputs = Inputs.of(grid, eyes, "latent")
     inputs = inputs._replace(contents=torch.cat([torch.zeros_like(sent[:1]), sent]))
-    return learn(built(lambda: TableTeam(inputs, config.value_gain), rng), grid, config, rng, report)
+    return learn(ppo.built(lambda: TableTeam(inputs, config.value_gain), rng), grid, config, rng, report)
 
 
 class TalkingTeam(TableTeam):
@@ -208,11 +183,4 @@ def train_grid_end_to_end(
     grid, rng = Grid(load_layout(config.layout)), Stream.READER.generator(seed, "cells", "end to end")
     eyes = cells(grid, encoder)
     inputs = Inputs.of(grid, eyes, "latent")
-    return learn(built(lambda: TalkingTeam(inputs, eyes), rng), grid, config, rng, report)
-
-
-def built(make: Callable[[], TableTeam], rng: np.random.Generator) -> TableTeam:
-    """A team whose weights are drawn from a generator."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        return make()
+    return learn(ppo.built(lambda: TalkingTeam(inputs, eyes), rng), grid, config, rng, report)

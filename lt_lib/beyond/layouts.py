@@ -3,6 +3,8 @@
 python -m lt_lib.beyond.layouts      writes params/layouts/sampled_<i>.yaml again
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import yaml
 
@@ -40,31 +42,33 @@ def proposed(name: str, rng: np.random.Generator) -> dict:
         ((turn, turn + bend), (out, mouth + wide)),
         ((turn, far), (out, out + wide)),
     ]
-    left = {"legs": [_rect(x, y) for x, y in legs], "slab": _rect(slab, (out, out + wide))}
+    left = {"legs": [rect(x, y) for x, y in legs], "slab": rect(slab, (out, out + wide))}
     right = {
-        "legs": [_rect(x, _mirrored(y)) for x, y in legs],
-        "slab": _rect(slab, _mirrored((out, out + wide))),
+        "legs": [rect(x, _mirrored(y)) for x, y in legs],
+        "slab": rect(slab, _mirrored((out, out + wide))),
     }
     values = load_layout("default").model_dump(mode="json")
-    values["scout"] |= {"x": _cm(far + rng.uniform(0.9, 1.6))}
-    points = [{"x": _cm(near - 0.3), "y": _cm(side * (mouth + wide / 2)), "heading": 0.0} for side in (1, -1)]
+    values["scout"] |= {"x": cm(far + rng.uniform(0.9, 1.6))}
+    points = [{"x": cm(near - 0.3), "y": cm(side * (mouth + wide / 2)), "heading": 0.0} for side in (1, -1)]
     return values | {
         "name": name,
-        "barrier": [_cm(near), _cm(far)],
+        "barrier": [cm(near), cm(far)],
         "corridors": {"left": left, "right": right},
         "choice_points": points,
     }
 
 
-def _rect(x, y) -> dict:
-    return {"x": [_cm(value) for value in x], "y": [_cm(value) for value in y]}
+def rect(x: Sequence[float], y: Sequence[float]) -> dict:
+    """A layout's rectangle, to the centimetre."""
+    return {"x": [cm(value) for value in x], "y": [cm(value) for value in y]}
 
 
 def _mirrored(y: tuple[float, float]) -> tuple[float, float]:
     return -y[1], -y[0]
 
 
-def _cm(value: float) -> float:
+def cm(value: float) -> float:
+    """Metres, to the centimetre."""
     return round(float(value), 2)
 
 
@@ -79,6 +83,11 @@ def sampled_layouts() -> dict[str, Layout]:
     return {name: sample_layout(name, Stream.LAYOUTS.generator(0, name)) for name in SAMPLED}
 
 
+def write(layout: Layout) -> None:
+    """Writes a layout's file among the project's."""
+    (LAYOUTS / f"{layout.name}.yaml").write_text(written(layout), encoding="utf-8")
+
+
 if __name__ == "__main__":
-    for name, layout in sampled_layouts().items():
-        (LAYOUTS / f"{name}.yaml").write_text(written(layout), encoding="utf-8")
+    for layout in sampled_layouts().values():
+        write(layout)

@@ -10,15 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lt_lib.beyond.deciders import learned
 from lt_lib.beyond.motion import errands, patrols
+from lt_lib.beyond.senders import frozen
 from lt_lib.comm.channel import ANCHOR, WIRES, Channel
 from lt_lib.comm.messages import CONTENT, CONTENTS, Sender
 from lt_lib.comm.receiver import Receiver
-from lt_lib.comm.route_head import RouteHead
+from lt_lib.comm.route_head import Chooser, RouteHead
 from lt_lib.envs.arena import CONTROL_HZ
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import SIDES, Layout, load_layout
@@ -36,15 +37,14 @@ WIRE = ANCHOR + 2 * CONTENT  # the widest content is two side by side
 
 
 class Drives(NamedTuple):
-    """N episodes: the slab's corridor, the navigator's place, each scout's poses, and whether it runs an errand."""
+    """N episodes: the slab's corridor, the navigator's place, and each scout's poses."""
 
     slab: Int[np.ndarray, " n"]
     navigator: Float[np.ndarray, "n 2"]
     poses: Float[np.ndarray, "n s t 3"]
-    errand: Bool[np.ndarray, " n"]
 
 
-class StreamHead(nn.Module):
+class StreamHead(Chooser):
     """The paper's receiver over a set of messages, and the route head on what it pools.
 
     Observations are flat: the navigator's place, n wires, and whether each has arrived.
@@ -62,14 +62,6 @@ class StreamHead(nn.Module):
         pooled = self.receiver(self.embed(place), wires.unflatten(1, (self.messages, WIRE)), present > 0)
         return self.head.outlook(torch.cat([place, pooled], dim=1))
 
-    def policy(self, observations: Float[Tensor, "b d"]) -> torch.distributions.Categorical:
-        return self.outlook(observations)[0]
-
-    def evaluate(self, observations: Float[Tensor, "b d"], actions: Int[Tensor, " b"]):
-        """Log-probability, entropy and value, each (b,)."""
-        policy, value = self.outlook(observations)
-        return policy.log_prob(actions), policy.entropy(), value
-
 
 def draw_drives(layout: Layout, config: MovingConfig, rng: np.random.Generator) -> Drives:
     """Episodes in which the first scout runs an errand with the configured probability, and all others patrol."""
@@ -78,7 +70,7 @@ def draw_drives(layout: Layout, config: MovingConfig, rng: np.random.Generator) 
     scouts = [patrols(layout, n, steps, config.watching, rng) for _ in range(config.scouts)]
     telling = errands(layout, 1 - slab, steps, rng)
     scouts[0] = np.where(errand[:, None, None], telling, scouts[0])
-    return Drives(slab, layout.spawn.sample(n, rng)[:, :2], np.stack(scouts, axis=1), errand)
+    return Drives(slab, layout.spawn.sample(n, rng)[:, :2], np.stack(scouts, axis=1))
 
 
 def stream(
@@ -110,7 +102,7 @@ def train_moving(
     """Heads of `config.heads` seeds that read one content from scouts that drive.
 
     "greedy"  (heads, scenes) whether the likelier route is the free one, in held-out episodes
-    "seeing"  (scenes,) share of the messages whose sender saw the slab;  "errand" (scenes,)
+    "seeing"  (scenes,) share of the messages whose sender saw the slab
     """
     layout = load_layout(config.layout)
     case = [str(getattr(config, name)) for name in ("errands", "watching", "scouts", "commit_step")]
@@ -126,7 +118,7 @@ def train_moving(
         with torch.no_grad():
             greedy.append(network.policy(observed[:cut]).logits.argmax(1).numpy() != drives.slab[:cut])
         report((head + 1) / config.heads)
-    return {"greedy": np.stack(greedy), "seeing": seeing[:cut], "errand": drives.errand[:cut]}
+    return {"greedy": np.stack(greedy), "seeing": seeing[:cut]}
 
 
 def _content(
@@ -169,7 +161,7 @@ class MovingProtocol:
     def read(self, cases: Mapping[Any, Mapping[str, Any]], what: str) -> dict[Any, Result]:
         """What heads make of each case, by the name of the case; a case changes settings of `MovingConfig`."""
         encoder = self.pixels.encoder_weights()
-        weights = only(encoder, "E") | only(encoder, "P") | {name: encoder[name] for name in ("mean", "std")}
+        weights = frozen(encoder) | only(encoder, "P")
         shared = self.sizes.model_dump() | {
             "layout": self.pixels.layout,
             "device": self.pixels.sizes.encoder.device,

@@ -13,7 +13,7 @@ import numpy as np
 from lt_lib.beyond.grid import GRID_SENDERS, train_grid_end_to_end, train_grid_reader
 from lt_lib.beyond.ladder import label
 from lt_lib.beyond.readers import train_end_to_end, train_readers
-from lt_lib.beyond.senders import SENDERS, measure_sender
+from lt_lib.beyond.senders import SENDERS, frozen, measure_sender
 from lt_lib.beyond.variance import perfect_bank
 from lt_lib.envs.layout import load_layout
 from lt_lib.gridworld.protocol import GridProtocol
@@ -36,7 +36,6 @@ from lt_lib.settings.perception import EncoderConfig
 from lt_lib.settings.profiles import validated
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore, fetch_by_name
-from lt_lib.store.states import only
 
 PAPER_S, END_TO_END, SILENT = "jepa", "end_to_end", "silence"
 DRAWN = ("untrained", "random")  # senders of which there are several, since nothing but their seed makes them
@@ -161,12 +160,13 @@ class ControlProtocol:
         sizes, encoders = self.sizes.variance, self._layout_encoders()
         trained_there = self.store.fetch(list(encoders.values()), "encoders of layouts")
         reading = self._reading() | {"heads": sizes.heads, "repeats": 1}
+        banks = {layout: perfect_bank(layout, sizes.draws) for layout in sizes.layouts}
         runs = [
             Run(
                 train_readers,
                 ReaderConfig(**reading | {"layout": layout}, sender=f"jepa {seed}", rung=rung),
                 SEED,
-                {"bank": perfect_bank(layout, sizes.draws), "sender": frozen(encoder)},
+                {"bank": banks[layout], "sender": frozen(encoder)},
             )
             for (layout, seed), encoder in zip(encoders, trained_there, strict=True)
         ]
@@ -222,11 +222,6 @@ def read_rungs(rungs: Sequence[Mapping[str, Any]]) -> list[Rung]:
         (HERE, NOISE, ANYWHERE, RECOLOURED), [label(rung) for rung in ladder], "rung", "rungs: predicted but "
     )
     return ladder
-
-
-def frozen(sender: Result) -> Result:
-    """What a sender needs to send: E and the normalisation."""
-    return only(sender, "E") | {name: sender[name] for name in ("mean", "std")}
 
 
 def _plain(config: SenderConfig, layout: str) -> EncoderConfig:

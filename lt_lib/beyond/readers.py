@@ -5,19 +5,20 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from sklearn.linear_model import LogisticRegression
-from torch import Tensor, nn
+from torch import Tensor
 
+from lt_lib import ppo
 from lt_lib.beyond.ladder import Scenes, draw_ladder_scenes, label
 from lt_lib.comm.channel import ANCHOR
-from lt_lib.comm.route_head import RouteHead
+from lt_lib.comm.route_head import Chooser, RouteHead
 from lt_lib.envs.layout import SIDES, load_layout
 from lt_lib.perception.encoder import LATENT, Encoder
 from lt_lib.perception.objective import normalisation
 from lt_lib.perception.pictures import PIXELS, SAMPLE, PictureEncoder
 from lt_lib.pixels.episodes import Outcomes, held_out_draws
-from lt_lib.pixels.route import Bank, Chooser, channel_of, learn
+from lt_lib.pixels.route import Bank, channel_of, learn
 from lt_lib.settings.beyond import EndToEndConfig, ReaderConfig
 from lt_lib.settings.streams import Stream
 from lt_lib.store.states import state_of
@@ -62,7 +63,6 @@ def train_readers(
     "greedy", "few"       (heads, scenes) of greedy choices on held-out scenes, each under both placements: after all
                           episodes, and of other heads after `config.share` of them
     "probe"               accuracy of a linear probe of the blocked corridor on what is sent in held-out scenes
-    "slab_pixels"         (e, slab) of the frames
     """
     scenes = scenes_of(config, bank)
     contents = sent(PictureEncoder(sender, config.device), scenes.pictures)
@@ -78,7 +78,6 @@ def train_readers(
         "greedy": np.stack([greedy for _, greedy in whole]),
         "few": np.stack([greedy for _, greedy in brief]),
         "probe": probe(training.contents, held_out.contents),
-        "slab_pixels": scenes.slab_pixels.astype(np.int16),
     }
 
 
@@ -93,9 +92,7 @@ def read(
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " scenes"]]:
     """Trains one head; returns whether each training episode's route was the free one, and `greedy_choices`."""
     rng = Stream.READER.generator(seed, config.sender, label(config.rung), str(config.episodes))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        head = RouteHead(ANCHOR + LATENT)
+    head = ppo.built(lambda: RouteHead(ANCHOR + LATENT), rng)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     channel = channel_of(config, config.batch, LATENT, rng)
     course = learn(head, optimiser, training, channel, config, rng, lambda _: None)
@@ -123,7 +120,7 @@ def probe(training: Float[Tensor, "e slab c"], held_out: Float[Tensor, "k slab c
     return float(fitted.score(held_out.flatten(0, 1).numpy(), np.tile(np.arange(len(SIDES)), len(held_out))))
 
 
-class EndToEnd(nn.Module):
+class EndToEnd(Chooser):
     """A sender's encoder and the head that reads it as one policy on raw wires: anchor and picture."""
 
     def __init__(self):
@@ -139,13 +136,9 @@ class EndToEnd(nn.Module):
         """What reaches the head: the anchor, and what the sender says."""
         return torch.cat([raw[:, :ANCHOR], self.said(raw[:, ANCHOR:])], dim=1)
 
-    def outlook(self, wire: Float[Tensor, "b w"]):
-        """The head's policy and value on the message."""
-        return self.head.outlook(self.message(wire))
-
-    def evaluate(self, observations: Float[Tensor, "b w"], actions: Int[Tensor, " b"]):
-        """Log-probability, entropy and value, each (b,); their gradient reaches the sender."""
-        return self.head.evaluate(self.message(observations), actions)
+    def outlook(self, observations: Float[Tensor, "b w"]):
+        """The head's policy and value on the message; their gradient reaches the sender."""
+        return self.head.outlook(self.message(observations))
 
 
 def train_end_to_end(
@@ -161,9 +154,7 @@ def train_end_to_end(
     scenes = scenes_of(config, bank)
     raw = torch.from_numpy(scenes.pictures.reshape(*scenes.pictures.shape[:2], -1)).float() / 255
     training, held_out = split(config, bank, scenes, raw)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        policy = EndToEnd()
+    policy = ppo.built(EndToEnd, rng)
     policy.encoder.to(config.device)
     groups = [{"params": policy.encoder.parameters(), "lr": config.sender_lr}, {"params": policy.head.parameters()}]
     optimiser = torch.optim.Adam(groups, lr=config.lr, eps=1e-5, fused=True)

@@ -7,7 +7,7 @@ To add one, write a function and list it in SENDERS.
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from lt_lib.perception.pictures import (
 )
 from lt_lib.settings.beyond import SenderConfig, SenderGateConfig
 from lt_lib.settings.streams import Stream
-from lt_lib.store.states import state_of
+from lt_lib.store.states import only, state_of
 
 Terms = Callable[[Int[np.ndarray, " b"], Int[np.ndarray, " b"]], Float[Tensor, " k"]]
 BATCH = 512  # frames per step of the incremental principal components
@@ -80,11 +80,15 @@ def projection(
     matrix: Float[np.ndarray, "64 d"], bias: Float[np.ndarray, "64"], pictures: Pictures, seed: int
 ) -> dict[str, np.ndarray]:
     """A linear sender, frozen."""
-    network = Projection()
-    with torch.no_grad():
-        network.linear.weight.copy_(torch.from_numpy(matrix))
-        network.linear.bias.copy_(torch.from_numpy(bias))
-    return frozen_on(network, pictures, Stream.SENDER.generator(seed))
+    return frozen_on(filled(Projection(), matrix, bias), pictures, Stream.SENDER.generator(seed))
+
+
+@torch.no_grad()
+def filled(network: nn.Module, matrix: Float[np.ndarray, "64 d"], bias: Float[np.ndarray, "64"]) -> nn.Module:
+    """A network with one `linear` layer, which gets this matrix and bias."""
+    network.linear.weight.copy_(torch.from_numpy(matrix))
+    network.linear.bias.copy_(torch.from_numpy(bias))
+    return network
 
 
 class Autoencoder(nn.Module):
@@ -118,17 +122,21 @@ def autoencoder(config: SenderConfig, seed: int, *, report: Callable[[float], No
 
 
 class Judging(nn.Module):
-    """The encoder and one logit: whether the slab stands in the right corridor."""
+    """An encoder and one logit: whether the slab stands in the right corridor."""
 
-    def __init__(self):
+    def __init__(self, encoder: nn.Module):
         super().__init__()
-        self.encoder, self.logit = Encoder(), nn.Linear(LATENT, 1)
+        self.encoder, self.logit = encoder, nn.Linear(LATENT, 1)
+
+    def cross_entropy(self, seen: Tensor, slab: Int[Tensor, " b"]) -> Float[Tensor, "1"]:
+        """Of the blocked corridor, from what the encoder takes."""
+        logits = self.logit(self.encoder(seen)).squeeze(1)
+        return F.binary_cross_entropy_with_logits(logits, slab.float())[None]
 
     def loss(self, pictures: Pictures, r: Int[np.ndarray, " b"], t: Int[np.ndarray, " b"]) -> Float[Tensor, "1"]:
-        """Cross-entropy of the blocked corridor in frames t of rollouts r."""
-        device = self.logit.weight.device
-        seen, slab = (torch.from_numpy(each).to(device) for each in (pictures.colours(r, t), pictures.rollouts.slab[r]))
-        return F.binary_cross_entropy_with_logits(self.logit(self.encoder(seen)).squeeze(1), slab.float())[None]
+        """`cross_entropy` in frames t of rollouts r."""
+        device, slab = self.logit.weight.device, pictures.rollouts.slab[r]
+        return self.cross_entropy(*(torch.from_numpy(each).to(device) for each in (pictures.colours(r, t), slab)))
 
 
 def supervised(config: SenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
@@ -137,7 +145,7 @@ def supervised(config: SenderConfig, seed: int, *, report: Callable[[float], Non
     def terms(model: Judging, pictures: Pictures) -> Terms:
         return lambda r, t: model.loss(pictures, r, t)
 
-    return trained(Judging, terms, config, seed, report)
+    return trained(lambda: Judging(Encoder()), terms, config, seed, report)
 
 
 def supervised_where_it_shows(config: SenderConfig, seed: int, *, report: Callable[[float], None]) -> dict:
@@ -152,15 +160,15 @@ def supervised_where_it_shows(config: SenderConfig, seed: int, *, report: Callab
 
         return loss
 
-    return trained(Judging, terms, config, seed, report)
+    return trained(lambda: Judging(Encoder()), terms, config, seed, report)
 
 
 class Contrasting(nn.Module):
-    """The encoder and the head on which the contrastive loss is taken (SimCLR)."""
+    """An encoder and the head on which the contrastive loss is taken (SimCLR)."""
 
-    def __init__(self):
+    def __init__(self, encoder: nn.Module):
         super().__init__()
-        self.encoder = Encoder()
+        self.encoder = encoder
         self.head = nn.Sequential(nn.ReLU(), nn.Linear(LATENT, 128), nn.ReLU(), nn.Linear(128, LATENT))
 
 
@@ -179,7 +187,7 @@ def contrastive(config: SenderConfig, seed: int, *, report: Callable[[float], No
 
         return loss
 
-    return trained(Contrasting, terms, config, seed, report)
+    return trained(lambda: Contrasting(Encoder()), terms, config, seed, report)
 
 
 def cross_entropy_of_pairs(
@@ -193,7 +201,7 @@ def cross_entropy_of_pairs(
 
 
 def trained(
-    network: type[nn.Module],
+    network: Callable[[], nn.Module],
     terms: Callable[[nn.Module, Pictures], Terms],
     config: SenderConfig,
     seed: int,
@@ -215,6 +223,11 @@ def frozen_on(network: nn.Module, pictures: Pictures, rng: np.random.Generator) 
     device = next(network.parameters()).device
     latents = network(torch.from_numpy(pictures.sample(rng)).to(device)).cpu().numpy()
     return state_of(network, "E") | normalisation(latents)
+
+
+def frozen(sender: Mapping[str, Any]) -> dict[str, Any]:
+    """What a trained sender needs to send: E and the normalisation."""
+    return only(sender, "E") | {name: sender[name] for name in ("mean", "std")}
 
 
 class Sender(NamedTuple):

@@ -5,9 +5,26 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 HIDDEN = 64
+Outlook = tuple[torch.distributions.Categorical, Float[Tensor, " b"]]  # a policy, and the value
 
 
-class RouteHead(nn.Module):
+class Chooser(nn.Module):
+    """What chooses a route from an observation; a subclass says how it looks at one."""
+
+    def outlook(self, observations: Float[Tensor, "b d"]) -> Outlook:
+        """The policy and the value."""
+        raise NotImplementedError
+
+    def policy(self, observations: Float[Tensor, "b d"]) -> torch.distributions.Categorical:
+        return self.outlook(observations)[0]
+
+    def evaluate(self, observations: Float[Tensor, "b d"], actions: Int[Tensor, " b"]):
+        """Log-probability, entropy and value, each (b,)."""
+        policy, value = self.outlook(observations)
+        return policy.log_prob(actions), policy.entropy(), value
+
+
+class RouteHead(Chooser):
     """One hidden layer of 64 units feeding two logits and a value; 4,483 parameters on a 66-float wire.
 
     The logits start at zero, so the first batches hold both routes in equal proportion.
@@ -20,15 +37,7 @@ class RouteHead(nn.Module):
         nn.init.zeros_(self.logits.weight)
         nn.init.zeros_(self.logits.bias)
 
-    def policy(self, wire: Float[Tensor, "b w"]) -> torch.distributions.Categorical:
-        return self.outlook(wire)[0]
-
-    def outlook(self, wire: Float[Tensor, "b w"]) -> tuple[torch.distributions.Categorical, Float[Tensor, " b"]]:
-        """The policy and the value."""
-        hidden = self.hidden(wire)
+    def outlook(self, observations: Float[Tensor, "b w"]) -> Outlook:
+        """The policy and the value on wires."""
+        hidden = self.hidden(observations)
         return torch.distributions.Categorical(logits=self.logits(hidden)), self.value(hidden).squeeze(1)
-
-    def evaluate(self, observations: Float[Tensor, "b w"], actions: Int[Tensor, " b"]):
-        """Log-probability, entropy and value, each (b,)."""
-        policy, value = self.outlook(observations)
-        return policy.log_prob(actions), policy.entropy(), value

@@ -145,10 +145,7 @@ def train_grid(
     """
     grid, rng = Grid(load_layout(config.layout)), Stream.GRID_POLICY.generator(seed, config.content, config.view)
     inputs = Inputs.of(grid, VIEWS[config.view](grid, encoder), config.content)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        team = TableTeam(inputs, config.value_gain)
-    return learn(team, grid, config, rng, report)
+    return learn(ppo.built(lambda: TableTeam(inputs, config.value_gain), rng), grid, config, rng, report)
 
 
 def learn(

@@ -246,9 +246,7 @@ def train_redrawn_head(
     commit_step = scenes["commit_step"]
     arena = LiveArena(config, commit_step, encoder, executor)
     spawn, scout = (scenes[name][held_out_draws(scenes) :] for name in ("spawn", "scout"))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        head = RouteHead(ANCHOR + CONTENT)
+    head = ppo.built(lambda: RouteHead(ANCHOR + CONTENT), rng)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     episodes, updates = [], []
     for start in range(0, config.episodes, config.batch):

@@ -5,7 +5,7 @@ one draw per episode is credited with the whole return; the head is never told w
 """
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 from lt_lib import ppo
 from lt_lib.comm.channel import ANCHOR, WIRES, Channel
 from lt_lib.comm.messages import CONTENTS, Sender
-from lt_lib.comm.route_head import RouteHead
+from lt_lib.comm.route_head import Chooser, RouteHead
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.perception.encoder import FrozenEncoder
@@ -138,24 +138,11 @@ def train_head(
     rng = Stream.HEAD.generator(seed, config.content, config.wire)
     training, held_out = read_bank(config, bank, encoder)
     width = training.contents.shape[-1]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        head = RouteHead(ANCHOR + width, training.blocks.shape[1])
+    head = ppo.built(lambda: RouteHead(ANCHOR + width, training.blocks.shape[1]), rng)
     optimiser = torch.optim.Adam(head.parameters(), lr=config.lr, eps=1e-5, fused=True)
     course = learn(head, optimiser, training, channel_of(config, config.batch, width, rng), config, rng, report)
     greedy = evaluate(head, held_out, channel_of(config, len(held_out.contents), width, rng), rng)
     return state_of(head, "head") | course | {f"greedy.{name}": values for name, values in greedy.items()}
-
-
-@runtime_checkable
-class Chooser(Protocol):
-    """What can learn to choose a route from a wire: a `RouteHead`, or an nn.Module with these methods of one."""
-
-    def outlook(self, wire: Tensor) -> tuple[torch.distributions.Categorical, Tensor]: ...
-
-    def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]: ...
-
-    def parameters(self): ...
 
 
 def learn(

@@ -7,7 +7,6 @@ A notebook collects its findings and writes them at its end:
     findings.write()
 """
 
-import json
 import math
 import operator
 import re
@@ -23,7 +22,7 @@ from lt_lib.report.entries import parsed, read_entries
 from lt_lib.report.firmness import firmness
 from lt_lib.report.inferred import INFERRED, calibrating_rows
 from lt_lib.settings.base import ROOT, Settings, UserError, require_known
-from lt_lib.store.files import content_digest, writable_folder, write_atomically
+from lt_lib.store.files import write_checked
 
 Notebook = Literal[
     "01_occlusion_check", "02_encoder", "03_gridworld", "04_pixels", "05_coverage_sweep",
@@ -309,9 +308,7 @@ class Findings:
         }
         head = {"notebook": self.notebook, "profile": self.profile, "pending": sorted(pending)}
         content = {**head, "findings": entries}
-        text = json.dumps({"sha256": content_digest(content), **content}, indent=1, ensure_ascii=False) + "\n"
-        writable_folder(self.path.parent)
-        write_atomically(self.path, text.encode())
+        write_checked(self.path, content)
         return self.path
 
 

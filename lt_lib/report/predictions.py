@@ -12,7 +12,7 @@ from lt_lib.report.claims import JUDGED
 from lt_lib.report.entries import parsed, read_entries
 from lt_lib.report.registration import Registration, register
 from lt_lib.settings.base import ROOT, Settings, UserError
-from lt_lib.store.files import content_digest, writable_folder, write_atomically
+from lt_lib.store.files import write_checked
 
 PREDICTIONS = ROOT / "params" / "predictions.yaml"
 HELD, NOT_HELD, NO_VERDICT = "held", "did not hold", ""
@@ -82,9 +82,7 @@ class Predictions:
             raise UserError(f"{self.notebook}: nothing found for {', '.join(missing)}")
         outcomes = {name: self.found[name].model_dump() | {"verdict": self.verdict(name)} for name in self.predicted}
         content = {"notebook": self.notebook, "profile": self.profile, "predictions": outcomes}
-        writable_folder(self.path.parent)
-        text = json.dumps({"sha256": content_digest(content), **content}, indent=1, ensure_ascii=False) + "\n"
-        write_atomically(self.path, text.encode())
+        write_checked(self.path, content)
         return self.path
 
     def table(self) -> pd.DataFrame:

@@ -75,6 +75,16 @@ def content_digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+def write_checked(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes a JSON file that holds its `content_digest`, whole or not at all; makes its folder.
+
+    Raises a one-line UserError if the folder cannot be written.
+    """
+    text = json.dumps({"sha256": content_digest(content), **content}, indent=1, ensure_ascii=False) + "\n"
+    writable_folder(path.parent)
+    write_atomically(path, text.encode())
+
+
 def outputs_folder(outputs: str, profile: str) -> Path:
     """Where a notebook's outputs go: the given folder, or the project's outputs/<profile> for ''.
 

@@ -187,9 +187,7 @@ def train_navigator(
     "boost" (U,)       factor on the lateral one in the window
     """
     rng = Stream.NAVIGATOR.generator(seed, *config.condition)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        navigator = read_navigator(start) if start else Navigator()
+    navigator = ppo.built(lambda: read_navigator(start) if start else Navigator(), rng)
     errand = Errand(config, FrozenEncoder(encoder, config.device, config.precision), rng)
     chains = Ar1(np.full(config.envs, config.boost.tau), rng)
     optimiser = torch.optim.Adam(navigator.parameters(), lr=config.lr, eps=1e-5, fused=True)
