@@ -375,6 +375,14 @@ def test_every_sender_of_the_gridworld_is_read(eyes):
         assert np.isfinite(result["entropy"]).all(), name
 
 
+@pytest.mark.parametrize("name", twin.GRID_SENDERS)
+def test_a_sender_of_the_gridworld_depends_on_its_seed_alone(name):
+    sender = twin.GRID_SENDERS[name]
+    one, other = (sender.train(WALKS.model_copy(update=dict(sender.changes)), 0, report=quiet) for _ in range(2))
+    for key in frozen(one):
+        np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+
+
 def test_a_talking_team_computes_what_a_team_with_its_contents_does_and_teaches_its_sender(eyes):
     grid = Grid(load_layout("grid"))
     views = cells(grid, eyes)

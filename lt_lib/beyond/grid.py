@@ -54,7 +54,7 @@ def principal_components(config: PatchSenderConfig, seed: int, *, report: Callab
     """The 64 leading principal components of the one-hot cells."""
     visits = visits_of(config, seed)
     seen = F.one_hot(torch.from_numpy(visits.seen(Stream.SENDER.generator(seed))).long(), len(CODES))
-    components = PCA(LATENT).fit(seen.flatten(1).numpy().astype(np.float64))
+    components = PCA(LATENT, svd_solver="covariance_eigh").fit(seen.flatten(1).numpy().astype(np.float64))
     return projection(components.components_, -components.components_ @ components.mean_, visits, seed)
 
 
