@@ -5,18 +5,20 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 
-from lt_lib.beyond.corridors import COUNTS, corridor_layout
-from lt_lib.beyond.deciders import HAND, MESSAGES, train_deciders
+from lt_lib.beyond.corridors import ARENAS, corridor_layout
+from lt_lib.beyond.deciders import MESSAGES, train_deciders
 from lt_lib.beyond.decisions import DecisionProtocol, ceiling
 from lt_lib.beyond.layouts import written
 from lt_lib.beyond.rich import DEPTHS, MAT, RichScenes, draw_rich_scenes, mats, rich_layout
-from lt_lib.beyond.tasks import TASKS
+from lt_lib.beyond.tasks import ANSWERS, TASKS
+from lt_lib.beyond.tasks.fixed_detour import COST
 from lt_lib.beyond.variance import perfect_bank
 from lt_lib.comm.messages import CONTENTS, Sender
 from lt_lib.envs.arena import Arena
 from lt_lib.envs.camera import FastCamera
-from lt_lib.envs.layout import NO_CORRIDOR, load_layout
+from lt_lib.envs.layout import NO_CORRIDOR, Layout, load_layout
 from lt_lib.envs.materials import HAZARD
 from lt_lib.envs.occlusion import occlusion, require_occlusion
 from lt_lib.envs.reference import ReferenceCamera
@@ -46,48 +48,74 @@ def untrained():
 
 
 # --- arenas
-@pytest.mark.parametrize("count", COUNTS)
-def test_the_arenas_are_the_generator_s_and_show_every_slab_to_the_scout_alone(count):
-    layout = corridor_layout(count)
-    assert (LAYOUTS / f"corridors_{count}.yaml").read_text() == written(layout)
-    one = layout.model_copy(update={"blocked": "one"})
+@pytest.mark.parametrize("name", ARENAS)
+def test_the_arenas_are_the_generator_s_and_show_every_slab_to_the_scout_alone(name):
+    layout, count = corridor_layout(name), ARENAS[name][0]
+    assert (LAYOUTS / f"{name}.yaml").read_text() == written(layout)
+    one = layout.model_copy(update={"blocked": (1,)})
     seen = occlusion(one, FastCamera(one, 256))
     assert seen.navigator.shape == (count, count) and not seen.navigator.any()
-    assert (seen.scout > 0).all() and len(layout.placements) == count
+    assert (seen.scout > 0).all() and (seen.scout.max() < 3 * seen.scout.min())
 
 
-def test_all_but_one_corridor_is_blocked(four):
-    assert four.placements == ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
-    np.testing.assert_array_equal(four.blocks, ~np.eye(4, dtype=bool))
+def test_any_number_of_corridors_is_blocked_but_never_all(four):
+    assert four.placements == ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))
+    np.testing.assert_array_equal(four.blocks, ~np.eye(4, dtype=bool)[::-1])
     assert load_layout("default").placements == ((0,), (1,))
+    several = load_layout("corridors_4_any")
+    assert [len(some) for some in several.placements] == [1] * 4 + [2] * 6 + [3] * 4
+    assert len({*several.placements}) == 14 and not several.blocks.all(axis=1).any()
+
+
+def test_a_copy_with_another_number_of_slabs_forgets_the_old_placements(four):
+    assert four.slabs.shape == (4, 3, 4)
+    one = four.model_copy(update={"blocked": (1,)})
+    assert one.placements == ((0,), (1,), (2,), (3,)) and one.slabs.shape == (4, 1, 4)
+    seen = HAZARD[FastCamera(one).frames(np.tile(one.scout.array, (4, 1)), np.arange(4), np.zeros((4, 2)))].sum((1, 2))
+    together = HAZARD[FastCamera(four).frames(four.scout.array[None], np.zeros(1, int), np.zeros((1, 2)))].sum()
+    assert together == seen[:3].sum()
+
+
+@pytest.mark.parametrize("blocked", [(4,), (1, 5), (1, 1), (0,), ()])
+def test_an_arena_without_a_free_corridor_is_refused_in_one_line(four, blocked):
+    with pytest.raises(ValidationError, match="blocked"):
+        Layout(**four.model_dump() | {"blocked": blocked})
+
+
+def test_where_the_corridors_lie(four):
     mouths = [corridor.legs[0] for corridor in four.routes]
     x, y = np.array([[leg.x[0] + 0.1, sum(leg.y) / 2] for leg in mouths] + [[-3.0, 0.0]]).T
     np.testing.assert_array_equal(four.corridor_at(x, y), [0, 1, 2, 3, NO_CORRIDOR])
 
 
-def test_several_slabs_are_drawn_as_mujoco_draws_them(four):
-    rng, n = np.random.default_rng(0), 60
-    slab = rng.integers(0, 4, n)
-    other = free_poses(four, slab, rng)
-    pose = free_poses(four, slab, rng, apart_from=other)
-    fast, slow = (camera.frames(pose, slab, other[:, :2]) for camera in (FastCamera(four), ReferenceCamera(four)))
+@pytest.mark.parametrize("name", ["corridors_4", "corridors_4_any"])
+def test_several_slabs_are_drawn_as_mujoco_draws_them(name):
+    rng, n, layout = np.random.default_rng(0), 60, load_layout(name)
+    slab = rng.integers(0, len(layout.placements), n)
+    other = free_poses(layout, slab, rng)
+    pose = free_poses(layout, slab, rng, apart_from=other)
+    fast, slow = (camera.frames(pose, slab, other[:, :2]) for camera in (FastCamera(layout), ReferenceCamera(layout)))
     assert (fast == slow).mean() > 0.998
     assert (HAZARD[fast].any((1, 2)) == HAZARD[slow].any((1, 2))).mean() > 0.98
 
 
-def test_the_slabs_of_a_placement_are_solid_and_the_free_corridor_is_free(four):
-    """A robot that pushes against every exit from beyond the barrier enters the free corridor alone."""
-    arena, count = Arena(four, 16), 4
-    slab, corridor = np.repeat(np.arange(count), count), np.tile(np.arange(count), count)
-    pose = np.zeros((16, 3))
-    pose[:, 0] = four.barrier[1] + 0.6
-    pose[:, 1] = [sum(four.routes[side].slab.y) / 2 for side in corridor]
+@pytest.mark.parametrize("name", ["corridors_4", "corridors_4_any"])
+def test_the_slabs_of_a_placement_are_solid_and_free_corridors_are_free(name):
+    """A robot that pushes against every exit from beyond the barrier enters the free corridors alone."""
+    layout = load_layout(name)
+    placements, count = layout.blocks.shape
+    n, arena = placements * count, Arena(layout, placements * count)
+    slab, corridor = (axis.ravel() for axis in np.indices((placements, count)))
+    pose = np.zeros((n, 3))
+    pose[:, 0] = layout.barrier[1] + 0.6
+    pose[:, 1] = [sum(layout.routes[side].slab.y) / 2 for side in corridor]
     pose[:, 2] = np.pi
-    arena.reset(np.ones(16, bool), pose, slab, np.tile(four.scout.array, (16, 1)))
+    arena.reset(np.ones(n, bool), pose, slab, np.tile(layout.scout.array, (n, 1)))
     for _ in range(15):
-        arena.step(np.tile([1.0, 0.0, 0.0], (16, 1)))
-    np.testing.assert_array_equal(arena.corridor == corridor, slab == corridor)
-    np.testing.assert_array_equal(arena.contact, slab != corridor)
+        arena.step(np.tile([1.0, 0.0, 0.0], (n, 1)))
+    blocked = layout.blocks[slab, corridor]
+    np.testing.assert_array_equal(arena.corridor == corridor, ~blocked)
+    np.testing.assert_array_equal(arena.contact, blocked)
 
 
 def test_an_arena_in_which_the_navigator_sees_a_slab_is_refused(four):
@@ -98,13 +126,13 @@ def test_an_arena_in_which_the_navigator_sees_a_slab_is_refused(four):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("corridors", [[2, 5], [4], ["2", 4]])
+@pytest.mark.parametrize("corridors", [[2, 5], [4], ["2", 4], [2, 3]])
 def test_impossible_numbers_of_corridors_are_refused_in_one_line(corridors):
     with pytest.raises(UserError, match="corridors") as error:
         validated(SECTIONS["corridors"], "corridors", corridors)
     assert "\n" not in str(error.value)
-    with pytest.raises(UserError, match="no arena with 5"):
-        DecisionProtocol.of([2, 5], {"executor": {"steps": 2}}, "cpu", 1)
+    with pytest.raises(UserError, match="unknown layout 'corridors_5'"):
+        DecisionProtocol.of({5: "corridors_5"}, {"executor": {"steps": 2}}, "cpu", 1)
 
 
 def test_an_executor_has_a_command_per_corridor(untrained):
@@ -127,7 +155,10 @@ def test_routes_are_drawn_with_their_probabilities():
     np.testing.assert_array_equal(drawn(two, np.random.default_rng(2)), expected)
 
 
-@pytest.mark.parametrize(("name", "bits"), [("corridors_3", 0), ("corridors_3", 1), ("corridors_6", 2), ("default", 1)])
+@pytest.mark.parametrize(
+    ("name", "bits"),
+    [("corridors_3", 0), ("corridors_3", 1), ("corridors_6", 2), ("corridors_4_any", 1), ("default", 1)],
+)
 def test_the_ceiling_is_the_best_of_all_senders_and_readers(name, bits):
     blocks = load_layout(name).blocks
     routes, best = blocks.shape[1], 0.0
@@ -150,7 +181,7 @@ def test_no_head_passes_the_ceiling_of_one_bit_unless_the_wire_leaks_more(conten
 
 def test_messages_by_hand_say_what_they_claim(four):
     sender = Sender(four, None, np.zeros((4, 64, 64), np.uint8), np.zeros((4, 3)), np.zeros((4, 2)), np.arange(4))
-    assert CONTENTS["half"](sender)[:, 0].tolist() == [1, 1, 0, 0]
+    assert CONTENTS["half"](sender)[:, 0].tolist() == [0, 0, 1, 1]
     assert CONTENTS["state"](sender)[:, :2].tolist() == [[0, 0], [1, 0], [0, 1], [1, 1]]
     assert not CONTENTS["state"](sender)[:, 2:].any() and not CONTENTS["half"](sender)[:, 1:].any()
 
@@ -179,11 +210,19 @@ def test_a_deeper_mat_shows_more_red_and_stands_before_its_own_exit(scenes):
     assert deep > 1.5 * flat > 0
 
 
-@pytest.mark.parametrize("task", HAND, ids=lambda task: task.words)
+@pytest.mark.parametrize("task", ANSWERS, ids=lambda task: task.words)
 def test_a_message_by_hand_decides_its_own_task(task, scenes):
     best = task.reward(scenes).argmax(axis=1)
     codes = task.bits(scenes) @ 2.0 ** np.arange(task.bits(scenes).shape[1])
     assert all(len(set(best[codes == code])) == 1 for code in set(codes)) and len(set(best)) > 1
+
+
+def test_a_fixed_detour_needs_the_depth_s_one_bit_at_its_own_cost(scenes):
+    task = TASKS["through or round at 0.6 m"]
+    best = task.reward(scenes).argmax(axis=1)
+    np.testing.assert_array_equal(best, (scenes.depth > COST).astype(int))
+    np.testing.assert_array_equal(task.bits(scenes)[:, 0], best)
+    assert task.own(scenes).shape == (len(scenes.depth), 0) and 0.3 < best.mean() < 0.9
 
 
 def test_through_or_round_depends_on_the_receiver_s_own_detour(scenes):

@@ -1,9 +1,9 @@
 """Arenas with C corridors from one generator: physics, camera, occlusion check and executor follow from the layout.
 
-    python -m lt_lib.beyond.corridors      writes params/layouts/corridors_<C>.yaml again
+    python -m lt_lib.beyond.corridors      writes params/layouts/corridors_*.yaml again
 
 All corridors are alike, side by side, and bend the same way; the arena, the scout's distance and the goal's grow with
-their number, so that the scout still sees every slab. One corridor is free, the others are blocked.
+their number, so that the scout still sees every slab. Any number of corridors can be blocked at a time.
 """
 
 import numpy as np
@@ -12,16 +12,22 @@ from lt_lib.beyond.layouts import cm, rect, write
 from lt_lib.envs.layout import Layout, load_layout
 from lt_lib.envs.occlusion import require_occlusion
 
-COUNTS = (2, 3, 4, 6)
+# name -> corridors, and how many of them are blocked at a time
+ARENAS = {f"corridors_{count}": (count, (count - 1,)) for count in (2, 3, 4, 6)} | {
+    "corridors_4_one": (4, (1,)),
+    "corridors_4_two": (4, (2,)),
+    "corridors_4_any": (4, (1, 2, 3)),
+}
 PITCH, OFFSET, HALF = 1.7, 0.95, 0.3  # metres: between corridors, from mouth to exit, half a corridor's width
 MARGIN = 1.1  # of the scout's distance, over the one from which it just sees the outermost slabs
 
 
-def corridor_layout(count: int) -> Layout:
-    """An arena with `count` corridors, numbered from the left, of which one is free.
+def corridor_layout(name: str) -> Layout:
+    """An arena of ARENAS, its corridors numbered from the left.
 
     Raises UserError if the navigator sees a slab from where it chooses, or the scout does not see one.
     """
+    count, blocked = ARENAS[name]
     values = load_layout("default").model_dump(mode="json")
     near, far = values["barrier"]
     mouths = [(count - 1) / 2 * PITCH + OFFSET / 2 - i * PITCH for i in range(count)]
@@ -32,8 +38,8 @@ def corridor_layout(count: int) -> Layout:
     layout = Layout(
         **values
         | {
-            "name": f"corridors_{count}",
-            "blocked": "all but one",
+            "name": name,
+            "blocked": blocked,
             "arena": {"x": [values["arena"]["x"][0], cm(scout + 3.0)], "y": [cm(-outer), cm(outer)]},
             "corridors": [_corridor(near, far, mouth, out) for mouth, out in zip(mouths, exits, strict=True)],
             "scout": values["scout"] | {"x": cm(scout), "y": cm(middle)},
@@ -55,5 +61,5 @@ def _corridor(near: float, far: float, mouth: float, out: float) -> dict:
 
 
 if __name__ == "__main__":
-    for count in COUNTS:
-        write(corridor_layout(count))
+    for name in ARENAS:
+        write(corridor_layout(name))

@@ -13,7 +13,7 @@ from torch import Tensor
 from lt_lib import ppo
 from lt_lib.beyond.rich import RichScenes, draw_rich_scenes, rich_layout
 from lt_lib.beyond.senders import frozen
-from lt_lib.beyond.tasks import TASKS
+from lt_lib.beyond.tasks import ANSWERS, TASKS
 from lt_lib.beyond.tasks.depth import classes
 from lt_lib.beyond.tasks.task import binary
 from lt_lib.comm.channel import anchor
@@ -29,12 +29,11 @@ from lt_lib.settings.streams import Stream
 from lt_lib.store.run import Result, Run
 
 Content = Callable[[RichScenes, PictureEncoder], np.ndarray]
-HAND = [task for task in TASKS.values() if task.words != "through or round"]  # tasks whose bits one hand can list
 
 MESSAGES: dict[str, Content] = (
     {"nothing": lambda scenes, _: np.empty((len(scenes.slab), 0))}
     | {f"'{task.words}' by hand": lambda scenes, _, task=task: task.bits(scenes) for task in TASKS.values()}
-    | {"all by hand": lambda scenes, _: np.concatenate([task.bits(scenes) for task in HAND], axis=1)}
+    | {"all by hand": lambda scenes, _: np.concatenate([task.bits(scenes) for task in ANSWERS], axis=1)}
     | {f"depth in {k} bits": lambda scenes, _, k=k: binary(classes(scenes, 2**k), k) for k in (2, 3, 4)}
     | {name: lambda scenes, sender: sender.latents(scenes.pictures) for name in ("latent", "untrained")}
 )
@@ -116,18 +115,9 @@ class DeciderProtocol:
     pixels: PixelProtocol
 
     @classmethod
-    def of(
-        cls,
-        decider: Mapping[str, Any],
-        broadcast: Mapping[str, Any],
-        layout: str,
-        device: str,
-        workers: int | str,
-        weights: str,
-    ) -> "DeciderProtocol":
-        """From a notebook's parameters. Raises UserError for unusable ones."""
-        sizes = validated(DeciderSizes, "decider", dict(decider))
-        return cls(sizes, PixelProtocol.of(broadcast, layout, device, workers, weights))
+    def of(cls, decider: Mapping[str, Any], pixels: PixelProtocol) -> "DeciderProtocol":
+        """From a notebook's parameter. Raises UserError for an unusable one."""
+        return cls(validated(DeciderSizes, "decider", dict(decider)), pixels)
 
     def decided(self, tasks: Collection[str], messages: Collection[str]) -> dict[tuple[str, str], Result]:
         """What heads of every task make of every message; see `train_deciders`."""

@@ -145,18 +145,9 @@ class MovingProtocol:
     pixels: PixelProtocol
 
     @classmethod
-    def of(
-        cls,
-        moving: Mapping[str, Any],
-        broadcast: Mapping[str, Any],
-        layout: str,
-        device: str,
-        workers: int | str,
-        weights: str,
-    ) -> "MovingProtocol":
-        """From a notebook's parameters. Raises UserError for unusable ones."""
-        sizes = validated(MovingSizes, "moving", dict(moving))
-        return cls(sizes, PixelProtocol.of(broadcast, layout, device, workers, weights))
+    def of(cls, moving: Mapping[str, Any], pixels: PixelProtocol) -> "MovingProtocol":
+        """From a notebook's parameter. Raises UserError for an unusable one."""
+        return cls(validated(MovingSizes, "moving", dict(moving)), pixels)
 
     def read(self, cases: Mapping[Any, Mapping[str, Any]], what: str) -> dict[Any, Result]:
         """What heads make of each case, by the name of the case; a case changes settings of `MovingConfig`."""

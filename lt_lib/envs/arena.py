@@ -46,8 +46,7 @@ class Arena:
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._mocap = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
         self._warm = self._batch.bind("qacc_warmstart")
-        centres = [[layout.slab(side).centre for side in blocked] for blocked in layout.placements]
-        self._slab_centres = np.array(centres)  # (placements, slabs, 2)
+        self._slab_centres = (layout.slabs[..., ::2] + layout.slabs[..., 1::2]) / 2  # (placements, slabs, 2)
         self.slab = np.zeros(n, np.int64)
         self.scout = np.tile(layout.scout.array, (n, 1))
 
@@ -119,7 +118,7 @@ def physics_xml(layout: Layout) -> str:
     slab = layout.slab(0)
     (cx, cy), (x0, x1, y0, y1) = slab.centre, slab.bounds
     centred = solid(Box((x0 - cx, x1 - cx, y0 - cy, y1 - cy), layout.wall_height, "slab"))
-    slabs = "".join(f'<body name="slab {i}" mocap="true">{centred}</body>' for i in range(len(layout.placements[0])))
+    slabs = "".join(f'<body name="slab {i}" mocap="true">{centred}</body>' for i in range(layout.slabs.shape[1]))
     radius, friction = layout.robot.radius, layout.robot.friction
     # sliding friction along the contact plane; torsion and rolling would brake a sphere that stands for a disc
     return f"""

@@ -24,8 +24,7 @@ class FastCamera:
         self._walls = np.array([wall.bounds for wall in layout.walls], np.float32)  # (W, 4) x0, x1, y0, y1
         self._wall_index = np.array([INDEX[f"{wall.material}_x"] for wall in layout.walls], np.uint8)  # (W,)
         self._wall_height = np.float32(layout.wall_height)
-        boxes = [[layout.slab(side).bounds for side in blocked] for blocked in layout.placements]
-        self._slabs = np.array(boxes if slabs is None else slabs, np.float32)  # (placements, slabs, 4)
+        self._slabs = np.array(layout.slabs if slabs is None else slabs, np.float32)  # (placements, slabs, 4)
         self._slab_height = np.float32(layout.slab_height)
         self._goal = np.array([layout.goal.x, layout.goal.y, *GOAL_PILLAR], np.float32)  # (4,) x, y, radius, height
         self._robot = np.array([layout.robot.radius, layout.robot.height], np.float32)  # (2,)

@@ -1,10 +1,11 @@
 """The one description of the scene (Fig. 1b), in metres. Physics, cameras and occlusion check are built from it."""
 
 from functools import cached_property
-from itertools import pairwise
-from typing import Annotated, Literal, NamedTuple
+from itertools import combinations, pairwise
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 from pydantic import (
     AfterValidator,
     Discriminator,
@@ -24,6 +25,7 @@ LEFT, RIGHT = 0, 1
 SIDES = ("left", "right")  # of the paper's two corridors
 NO_CORRIDOR = -1
 OUTER_THICKNESS = 0.1  # metres
+FAR = 100.0  # metres outside of the arena, where slabs wait that a placement does not need
 
 
 def _ordered(interval: tuple[float, float]) -> tuple[float, float]:
@@ -145,7 +147,7 @@ class Layout(Settings):
         | Annotated[Annotated[tuple[Corridor, ...], Field(min_length=2)], Tag("several")],
         Discriminator(lambda value: "several" if isinstance(value, list | tuple) else "pair"),
     ]
-    blocked: Literal["one", "all but one"] = "one"  # corridors at a time
+    blocked: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1,)  # how many corridors, at a time
     slab_height: PositiveFloat
     robot: Robot
     camera: Camera
@@ -169,13 +171,19 @@ class Layout(Settings):
     def placements(self) -> tuple[tuple[int, ...], ...]:
         """The corridors blocked under each placement of the slabs; with two corridors, placement 0 blocks the left."""
         corridors = range(len(self.routes))
-        if self.blocked == "one":
-            return tuple((i,) for i in corridors)
-        return tuple(tuple(other for other in corridors if other != i) for i in corridors)
+        return tuple(some for number in self.blocked for some in combinations(corridors, number))
 
     @cached_property
-    def blocks(self) -> np.ndarray:
-        """Whether each placement blocks each corridor, (placements, corridors)."""
+    def slabs(self) -> Float[np.ndarray, "placements slabs 4"]:
+        """Footprints (x0, x1, y0, y1) of equally many slabs under each placement; spare ones lie far outside."""
+        most = max(map(len, self.placements))
+        spare = np.array(self.slab(0).bounds) + [FAR, FAR, 0, 0]
+        each = [[self.slab(side).bounds for side in some] + [spare] * (most - len(some)) for some in self.placements]
+        return np.array(each)
+
+    @cached_property
+    def blocks(self) -> Bool[np.ndarray, "placements corridors"]:
+        """Whether each placement blocks each corridor."""
         return np.array([[i in blocked for i in range(len(self.routes))] for blocked in self.placements])
 
     @cached_property
@@ -230,6 +238,11 @@ class Layout(Settings):
             raise ValueError(f"slab_height {self.slab_height} m must not exceed wall_height {self.wall_height} m")
         if not self.camera.height < self.wall_height:
             raise ValueError(f"camera.height {self.camera.height} m must be below wall_height {self.wall_height} m")
+        if max(self.blocked) >= len(self.routes) or len(set(self.blocked)) < len(self.blocked):
+            raise ValueError(
+                f"blocked: expected different numbers from 1 to {len(self.routes) - 1}, so that one of "
+                f"{len(self.routes)} corridors stays free, got {list(self.blocked)}"
+            )
         for side, corridor in zip(self.sides, self.routes, strict=True):
             self._check_corridor(side, corridor)
         sizes = [(round(c.slab.x[1] - c.slab.x[0], 6), round(c.slab.y[1] - c.slab.y[0], 6)) for c in self.routes]

@@ -59,7 +59,7 @@ def under_each(camera, eye: Pose, other: Pose, placements: int) -> Int[np.ndarra
 
 def require_occlusion(layout: Layout) -> None:
     """Raises a one-line UserError if the navigator can see the slab from a choice point or the scout cannot see it."""
-    seen = occlusion(layout, FastCamera(layout.model_copy(update={"blocked": "one"}), PIXELS))
+    seen = occlusion(layout, FastCamera(layout.model_copy(update={"blocked": (1,)}), PIXELS))
     for slab, side in enumerate(layout.sides):
         for i, pixels in enumerate(seen.navigator[:, slab]):
             if pixels:

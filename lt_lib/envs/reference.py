@@ -86,8 +86,8 @@ def place(layout: Layout, model, data, eye, slab: int, other):
     height = layout.camera.height
     data.mocap_pos[model.body("navigator").mocapid[0]] = (eye[0], eye[1], height)
     data.mocap_quat[model.body("navigator").mocapid[0]] = (np.cos(eye[2] / 2), 0, 0, np.sin(eye[2] / 2))
-    for i, side in enumerate(layout.placements[slab]):
-        data.mocap_pos[model.body(f"slab {i}").mocapid[0]] = (*layout.slab(side).centre, 0)
+    for i, (x0, x1, y0, y1) in enumerate(layout.slabs[slab]):
+        data.mocap_pos[model.body(f"slab {i}").mocapid[0]] = ((x0 + x1) / 2, (y0 + y1) / 2, 0)
     data.mocap_pos[model.body("scout").mocapid[0]] = (other[0], other[1], 0)
     mujoco.mj_forward(model, data)
 
@@ -106,7 +106,7 @@ def scene_xml(layout: Layout, pixels: int) -> str:
       <geom name="slab_z:{i}" type="box" pos="0 0 {slab.height - FACE / 2}"
             size="{sx / 2} {sy / 2} {FACE / 2}" {_rgba("slab_z")}/>
     </body>'''
-        for i in range(len(layout.placements[0]))
+        for i in range(layout.slabs.shape[1])
     )
     return f"""
 <mujoco>

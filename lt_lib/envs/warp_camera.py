@@ -27,7 +27,7 @@ class WarpCamera:
         self._layout, pixels = layout, layout.camera.pixels
         model = mujoco.MjModel.from_xml_string(scene_xml(layout, pixels))
         self._index, self._device = palette_indices(model), device
-        slabs = [f"slab {i}" for i in range(len(layout.placements[0]))]
+        slabs = [f"slab {i}" for i in range(layout.slabs.shape[1])]
         self._mocap = {name: model.body(name).mocapid[0] for name in ("navigator", *slabs, "scout")}
         with wp.ScopedDevice(device):
             self._model = mjw.put_model(model)
@@ -58,9 +58,9 @@ class WarpCamera:
         turn[:, self._mocap["navigator"]] = 0
         turn[:, self._mocap["navigator"], 0] = np.cos(eyes[:, 2] / 2)
         turn[:, self._mocap["navigator"], 3] = np.sin(eyes[:, 2] / 2)
-        for i, sides in enumerate(zip(*self._layout.placements, strict=True)):
-            centres = np.array([self._layout.slab(side).centre for side in sides])  # of slab i in every placement
-            position[:, self._mocap[f"slab {i}"], :2] = centres[slabs]
+        boxes = self._layout.slabs[slabs]  # (B, slabs, 4)
+        for i, centre in enumerate(np.moveaxis((boxes[..., ::2] + boxes[..., 1::2]) / 2, 1, 0)):
+            position[:, self._mocap[f"slab {i}"], :2] = centre
         position[:, self._mocap["scout"], :2] = others
         with wp.ScopedDevice(self._device):
             self._data.mocap_pos.assign(position)

@@ -39,6 +39,13 @@ class Settings(BaseModel):
             return {name: _frozen(value) for name, value in values.items()}
         return values
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> "Settings":
+        """A copy with some fields replaced; nothing that was computed from the old ones comes along."""
+        copied = super().model_copy(update=update, deep=deep)
+        for computed in copied.__dict__.keys() - type(copied).model_fields.keys():
+            del copied.__dict__[computed]
+        return copied
+
 
 LAYOUTS = ROOT / "params" / "layouts"
 

@@ -3,11 +3,11 @@
 import ast
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
 
 from lt_lib.settings.base import ROOT, Share, UserError, refuse_decided, require_known
 from lt_lib.settings.beyond import ControlsConfig, DeciderSizes, MovingSizes, Rung
@@ -146,6 +146,18 @@ def _inside(settings: Any, part: str | int) -> Any:
     return next(kind for kind in reversed(get_args(settings)) if kind is not ...)
 
 
+def _with(needed: Collection[Any]) -> AfterValidator:
+    """A list must hold some values, about which something was predicted (params/predictions.yaml)."""
+
+    def check(values: list[Any]) -> list[Any]:
+        for value in needed:
+            if value not in values:
+                raise ValueError(f"must hold {value!r}, about which a prediction was written down")
+        return values
+
+    return AfterValidator(check)
+
+
 def _listed(names: Any) -> str:
     return ", ".join(sorted(names))
 
@@ -199,7 +211,8 @@ SECTIONS: dict[str, Any] = {
     "effects": Annotated[list[str], Field(min_length=1)],
     "device": Literal["auto", "cpu", "cuda"],
     "controls": ControlsConfig,
-    "corridors": Annotated[list[Literal[2, 3, 4, 6]], Field(min_length=2)],  # those of beyond.corridors.COUNTS
+    "corridors": Annotated[list[Literal[2, 3, 4, 6]], Field(min_length=2), _with([4])],  # of beyond.corridors.ARENAS
+    "slabs": Annotated[list[Literal["one", "two", "any"]], _with(["one", "any"])],  # of beyond.corridors.ARENAS
     "early": PositiveInt,
     "message_seeds": dict[str, PositiveInt],
     "broadcast": PixelsConfig,
