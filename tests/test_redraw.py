@@ -95,8 +95,8 @@ def test_one_draw_an_episode_is_the_bank_s_episode_exactly(frozen, near):
     np.testing.assert_array_equal(decisions.episode, np.arange(30))
     route = decisions.routes.numpy()
     assert 5 < route.sum() < 25
-    encoder, executor = FrozenEncoder(frozen.encoder), FrozenExecutor(frozen.executor)
-    expected = drive(load_layout(near), encoder, executor, draws, slab, route, envs=ROWS, commit_step=COMMIT_STEP)
+    encoder, executor, scene = FrozenEncoder(frozen.encoder), FrozenExecutor(frozen.executor), load_layout(near)
+    expected = drive(Arena(scene, ROWS), FastCamera(scene), encoder, executor, draws, slab, route, COMMIT_STEP)
     for name, values in expected._asdict().items():
         np.testing.assert_array_equal(getattr(outcome, name), values, err_msg=name)
     assert outcome.success.any() and not outcome.success.all()

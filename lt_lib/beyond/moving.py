@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from lt_lib.beyond.deciders import learned
@@ -47,20 +47,38 @@ class Drives(NamedTuple):
 class StreamHead(Chooser):
     """The paper's receiver over a set of messages, and the route head on what it pools.
 
-    Observations are flat: the navigator's place, n wires, and whether each has arrived.
+    Observations are flat: the navigator's place, n wires of some width, and whether each has arrived; see `observed`.
     """
 
-    def __init__(self, messages: int, routes: int = 2):
+    def __init__(self, messages: int, wire: int = WIRE, routes: int = 2):
         super().__init__()
-        self.messages = messages
+        self._shape = messages, wire
         self.embed = nn.Sequential(nn.Linear(EGO, POOLED), nn.Tanh())
-        self.receiver, self.head = Receiver(POOLED, WIRE, POOLED), RouteHead(EGO + POOLED, routes)
+        self.receiver, self.head = Receiver(POOLED, wire, POOLED), RouteHead(EGO + POOLED, routes)
 
     def outlook(self, observations: Float[Tensor, "b d"]):
         """The head's policy and value on the pooled messages."""
-        place, wires, present = observations.split([EGO, self.messages * WIRE, self.messages], dim=1)
-        pooled = self.receiver(self.embed(place), wires.unflatten(1, (self.messages, WIRE)), present > 0)
+        place, wires, present = self._parts(observations)
+        pooled = self.receiver(self.embed(place), wires, present)
         return self.head.outlook(torch.cat([place, pooled], dim=1))
+
+    def attention(self, observations: Float[Tensor, "b d"]) -> Float[Tensor, "b n"]:
+        """The weight of each message in what is pooled."""
+        place, wires, present = self._parts(observations)
+        return self.receiver.attention(self.embed(place), wires, present)
+
+    def _parts(self, observations: Float[Tensor, "b d"]):
+        messages, wire = self._shape
+        place, wires, present = observations.split([EGO, messages * wire, messages], dim=1)
+        return place, wires.unflatten(1, self._shape), present > 0
+
+
+def observed(
+    layout: Layout, navigator: Float[np.ndarray, "b 2"], wires: Float[Tensor, "b n w"], present: Bool[Tensor, "b n"]
+) -> Float[Tensor, "b d"]:
+    """What a `StreamHead` observes: the navigator's place in communication radii, and the messages."""
+    place = torch.from_numpy(navigator / layout.communication_radius).float()
+    return torch.cat([place, wires.flatten(1), present.float()], dim=1)
 
 
 def draw_drives(layout: Layout, config: MovingConfig, rng: np.random.Generator) -> Drives:
@@ -92,8 +110,7 @@ def stream(
             arrived.append(wires)
             present.append((wires != 0).any(dim=2))
     wires, there = torch.cat(arrived, dim=1), torch.cat(present, dim=1)
-    place = torch.from_numpy(drives.navigator / layout.communication_radius).float()
-    return torch.cat([place, wires.flatten(1), there.float()], dim=1), np.stack(seeing, axis=2).mean((1, 2))
+    return observed(layout, drives.navigator, wires, there), np.stack(seeing, axis=2).mean((1, 2))
 
 
 def train_moving(

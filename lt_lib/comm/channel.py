@@ -1,4 +1,4 @@
-"""The channel, the same for every content: anchor, range, latency (Section Broadcast and anchor).
+"""The channel, the same for every content: anchor, range, latency, loss (Section Broadcast and anchor).
 
 `CORRUPTIONS` are what can happen to a wire in transit (Section Corruption controls); 'intact' changes nothing.
 """
@@ -21,13 +21,14 @@ class Channel:
 
     A message sent at step t arrives at step t + latency and at no other. The anchor is the sender's position at sending
     relative to the receiver's at arrival, in communication radii. The wire is zeros for a sender farther away than the
-    radius and for one whose message has not arrived.
+    radius and for one whose message has not arrived or is lost.
 
     senders  shape of the senders, (b,) or, if each receiver hears n of them, (b, n)
     width    floats of the content
     radius   metres
     latency  control steps
     corrupt  what happens to the wires (..., 2 + width) of one step in transit
+    lost     says of some rows which of the messages that they send now are lost; `comm.loss`. The paper loses none
     """
 
     def __init__(
@@ -37,13 +38,14 @@ class Channel:
         radius: float,
         latency: int = LATENCY,
         corrupt: Callable[[Tensor], Tensor] | None = None,
+        lost: Callable[[Int[np.ndarray, " b"]], Bool[np.ndarray, "b ..."]] | None = None,
     ):
         self.latency, self.senders = latency, senders[0]
-        self._radius, self._corrupt = radius, corrupt
+        self._radius, self._corrupt, self._lost = radius, corrupt, lost
         slots = latency + 1  # steps in flight at once; a step's slot is its remainder
         self._content = torch.zeros(slots, *senders, width)
         self._sender = np.zeros((slots, *senders, 2))
-        self._sent_at = np.full((slots, senders[0]), NEVER)
+        self._sent_at = np.full((slots, *senders), NEVER)
 
     def send(
         self,
@@ -57,7 +59,10 @@ class Channel:
         rows  the rows that send, all by default
         """
         slot, rows = self._slots(step, rows)
-        self._content[slot, rows], self._sender[slot, rows], self._sent_at[slot, rows] = content, sender, step
+        self._content[slot, rows], self._sender[slot, rows] = content, sender
+        self._sent_at[slot, rows] = self._as_senders(step, rows)
+        if self._lost:
+            self._sent_at[slot, rows] = np.where(self._lost(rows), NEVER, self._sent_at[slot, rows])
 
     def receive(
         self,
@@ -74,8 +79,8 @@ class Channel:
         wire = torch.cat([offset, self._content[slot, rows]], dim=-1)
         if self._corrupt:
             wire = self._corrupt(wire.flatten(0, -2)).reshape(wire.shape)
-        arrived = torch.from_numpy(self._sent_at[slot, rows] == sent_at).reshape(-1, *others, 1)
-        return wire * (arrived & heard(offset)[..., None])
+        arrived = torch.from_numpy(self._sent_at[slot, rows] == self._as_senders(sent_at, rows))
+        return wire * (arrived & heard(offset))[..., None]
 
     def forget(self) -> None:
         """Loses whatever is in flight: a new episode begins."""
@@ -84,6 +89,10 @@ class Channel:
     def _slots(self, step, rows) -> tuple[np.ndarray, np.ndarray]:
         rows = np.arange(self._sent_at.shape[1]) if rows is None else rows
         return np.zeros_like(rows) + step % (self.latency + 1), rows
+
+    def _as_senders(self, step, rows) -> np.ndarray:
+        """A step, or one per row, in a shape that broadcasts over each row's senders."""
+        return (np.zeros_like(rows) + step).reshape(-1, *(1,) * (self._sent_at.ndim - 2))
 
 
 def anchor(

@@ -17,6 +17,7 @@ CROP = 64  # side in pixels of what an encoder is given
 WIDTH, HEIGHT = 160, 120  # pixels of a frame of the surrogate camera, whose central 64 x 64 are the crop
 OVERSAMPLING = 2  # rendered pixels per pixel, along each axis
 FOCAL = CROP / 2 / np.tan(np.deg2rad(FOV) / 2)  # pixels
+CORNER = (WIDTH - 1 / OVERSAMPLING) ** 2 + (HEIGHT - 1 / OVERSAMPLING) ** 2  # square of the frame's diagonal, pixels
 MARGIN = 1.1  # of the frame's width, rendered so that a distorted frame has no empty corner
 
 
@@ -28,9 +29,9 @@ class Shot(NamedTuple):
     blur: Float[np.ndarray, "2"]  # pixels right and down that the picture moves
 
 
-def rendered_size() -> tuple[int, int]:
-    """Width and height in pixels of the picture that `expose` takes."""
-    return tuple(round(MARGIN * OVERSAMPLING * side / 2) * 2 for side in (WIDTH, HEIGHT))
+def rendered_size(size: tuple[int, int] = (WIDTH, HEIGHT)) -> tuple[int, int]:
+    """Width and height in pixels of the picture that `expose` takes for a frame of this size, or for a central part."""
+    return tuple(round(MARGIN * OVERSAMPLING * side / 2) * 2 for side in size)
 
 
 def draw_shot(optics: OpticsConfig, rng: np.random.Generator) -> Shot:
@@ -41,12 +42,19 @@ def draw_shot(optics: OpticsConfig, rng: np.random.Generator) -> Shot:
 
 
 def expose(
-    picture: UInt8[np.ndarray, "h w 3"], optics: OpticsConfig, shot: Shot, rng: np.random.Generator
-) -> UInt8[np.ndarray, "120 160 3"]:
-    """A frame of the camera, RGB, from a rendered picture of `rendered_size`."""
+    picture: UInt8[np.ndarray, "h w 3"],
+    optics: OpticsConfig,
+    shot: Shot,
+    rng: np.random.Generator,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+) -> UInt8[np.ndarray, "fh fw 3"]:
+    """A frame of the camera, RGB, from a rendered picture of `rendered_size`.
+
+    size  width and height in pixels: of the whole frame, or of a central part of it
+    """
     light = linear(picture)
-    light = _blurred(_through_lens(light, optics), shot.blur)
-    light = cv2.resize(light, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) * (shot.exposure * shot.balance)
+    light = _blurred(_through_lens(light, optics, size), shot.blur)
+    light = cv2.resize(light, size, interpolation=cv2.INTER_AREA) * (shot.exposure * shot.balance)
     return _developed(_sensed(light, optics, rng), optics)
 
 
@@ -69,15 +77,15 @@ def encoded(light: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.round(255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)
 
 
-def _through_lens(light, optics: OpticsConfig):
+def _through_lens(light, optics: OpticsConfig, size: tuple[int, int]):
     """Radial distortion and vignetting; out comes the frame without the margin, oversampled."""
-    height, width, focal = HEIGHT * OVERSAMPLING, WIDTH * OVERSAMPLING, FOCAL * OVERSAMPLING
+    (width, height), focal = (side * OVERSAMPLING for side in size), FOCAL * OVERSAMPLING
     u, v = np.meshgrid((np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal)
     r2 = u**2 + v**2
     stretch = focal * (1 + optics.distortion * r2)
     x, y = u * stretch + light.shape[1] / 2 - 0.5, v * stretch + light.shape[0] / 2 - 0.5
     bent = cv2.remap(light, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    return bent * (1 - optics.vignetting * r2 / r2.max())[..., None].astype(np.float32)
+    return bent * (1 - optics.vignetting * r2 * (2 * FOCAL) ** 2 / CORNER)[..., None].astype(np.float32)
 
 
 def _blurred(light, shift: Float[np.ndarray, "2"]):

@@ -3,20 +3,27 @@
 It shares the layout's geometry with the fast camera and nothing else: no colour, no light, no line of drawing code.
 """
 
+from typing import Literal
+
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from lt_lib.envs.arena import solid
 from lt_lib.envs.layout import Layout
+from lt_lib.envs.materials import GOAL_PILLAR
 from lt_lib.envs.opengl import open_renderer
-from lt_lib.hardware.placements import OBJECTS, Placements
+from lt_lib.hardware.placements import CLUTTER, OBJECTS, Placements
 
 TEXELS = 256
 TILE = 0.5  # metres that a texture spans
 # Materials of the room, RGB: beige vinyl, whitewashed boards, cardboard, red lacquer, the room behind
 COLOURS = {"floor": (150, 138, 120), "wall": (214, 210, 200), "barrier": (176, 146, 108), "slab": (196, 30, 38)}
 ROOM = ((0.62, 0.64, 0.66), (0.35, 0.33, 0.32))  # upper and lower colour of the background
+GOAL, ROBOT = (0.2, 0.5, 0.24), (0.85, 0.68, 0.2)  # painted wood, and yellow plastic
+UNDERGROUND = (0.0, 0.0, -5.0)  # where bodies wait that a picture does not show
+Light = Literal["bright", "dim", "even"]
+LAMPS = {"bright": (1, 1), "dim": (1, 0), "even": (0, 0)}  # the left one and the right one, on or off
 WARM = (1.0, 0.86, 0.68)  # colour of the one lamp that is left in the dim state
 SHAPES = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 
@@ -40,8 +47,21 @@ class SurrogateScene:
 
     def picture(self, placements: Placements, i: int, clutter: int) -> UInt8[np.ndarray, "h w 3"]:
         """Placement i, RGB, with `clutter` objects on the floor; under two lamps, or under one if it is a dim one."""
-        self._place(placements, i, clutter)
-        self._light(bool(placements.dim[i]))
+        self._place(placements.eye[i], int(placements.slab[i]), placements.slab_offset[i])
+        self._scatter(placements.clutter[i][:clutter])
+        return self._drawn("dim" if placements.dim[i] else "bright")
+
+    def sight(
+        self, eye: Float[np.ndarray, "3"], slab: int, other: Float[np.ndarray, "2"], light: Light
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """What a robot sees that drives: the slab exactly in its corridor, the other robot (metres), a bare floor."""
+        self._place(eye, slab, np.zeros(3))
+        self._scatter(np.empty((0, CLUTTER)))
+        self._move("robot", (*other, 0.0), 0.0)
+        return self._drawn(light)
+
+    def _drawn(self, light: Light) -> UInt8[np.ndarray, "h w 3"]:
+        self._light(light)
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, camera="eye")
         return self._renderer.render().copy()
@@ -49,15 +69,20 @@ class SurrogateScene:
     def close(self):
         self._renderer.close()
 
-    def _place(self, placements: Placements, i: int, clutter: int):
-        x, y, heading = placements.eye[i]
+    def _place(self, eye: Float[np.ndarray, "3"], slab: int, offset: Float[np.ndarray, "3"]):
+        """The camera, and the slab off its corridor by so much (metres, metres, radians); no other robot."""
+        x, y, heading = eye
         self._move("eye", (x, y, self._layout.camera.height), heading)
-        slab, (dx, dy, turn) = self._layout.slab(int(placements.slab[i])).centre, placements.slab_offset[i]
-        self._move("slab", (slab[0] + dx, slab[1] + dy, self._layout.slab_height / 2), turn)
-        for k, (x, y, width, height, yaw, *colour, shape) in enumerate(placements.clutter[i]):
+        (x, y), (dx, dy, turn) = self._layout.slab(slab).centre, offset
+        self._move("slab", (x + dx, y + dy, self._layout.slab_height / 2), turn)
+        self._move("robot", UNDERGROUND, 0.0)
+
+    def _scatter(self, objects: Float[np.ndarray, "k 9"]):
+        for k in range(OBJECTS):
+            self._move(f"clutter {k}", UNDERGROUND, 0.0)
+        for k, (x, y, width, height, yaw, *colour, shape) in enumerate(objects):
             geom = self._model.geom(f"clutter {k}").id
-            # an object that is not there lies under the floor
-            self._move(f"clutter {k}", (x, y, height / 2 if k < clutter else -1.0), yaw)
+            self._move(f"clutter {k}", (x, y, height / 2), yaw)
             self._model.geom_type[geom] = SHAPES[int(shape)]
             self._model.geom_size[geom] = (width, height / 2, 0) if shape == 1 else (width, width, height / 2)
             self._model.geom_rgba[geom, :3] = colour
@@ -67,13 +92,14 @@ class SurrogateScene:
         self._data.mocap_pos[mocap] = position
         self._data.mocap_quat[mocap] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
 
-    def _light(self, dim: bool):
-        """Both lamps, or the left one alone and warm."""
+    def _light(self, light: Light):
+        """Both lamps, or the left one alone and warm, or none but light from everywhere."""
         diffuse, specular, ambient = self._lights
-        colour, on = np.array(WARM) if dim else np.ones(3), np.array([[1.0], [0.0 if dim else 1.0]])
-        self._model.light_diffuse[:] = diffuse * colour * on
-        self._model.light_specular[:] = specular * colour * on
-        self._model.vis.headlight.ambient = ambient * colour
+        colour, on = np.array(WARM) if light == "dim" else np.ones(3), np.array(LAMPS[light])
+        self._model.light_active[:] = on
+        self._model.light_diffuse[:] = diffuse * colour * on[:, None]
+        self._model.light_specular[:] = specular * colour * on[:, None]
+        self._model.vis.headlight.ambient = np.ones(3) if light == "even" else ambient * colour
 
 
 def scene_xml(layout: Layout, width: int, height: int, fovy: float) -> str:
@@ -114,6 +140,12 @@ def scene_xml(layout: Layout, width: int, height: int, fovy: float) -> str:
       <geom type="box" size="{(x1 - x0) / 2} {(y1 - y0) / 2} {layout.slab_height / 2}" material="slab"/>
     </body>
     {objects}
+    <geom type="cylinder" pos="{layout.goal.x} {layout.goal.y} {GOAL_PILLAR[1] / 2}"
+          size="{GOAL_PILLAR[0]} {GOAL_PILLAR[1] / 2}" rgba="{_numbers(GOAL)} 1"/>
+    <body name="robot" mocap="true">
+      <geom type="cylinder" pos="0 0 {layout.robot.height / 2}" size="{layout.robot.radius} {layout.robot.height / 2}"
+            rgba="{_numbers(ROBOT)} 1"/>
+    </body>
     <body name="eye" mocap="true"><camera name="eye" fovy="{fovy}" xyaxes="0 -1 0 0 0 1"/></body>
   </worldbody>
 </mujoco>"""

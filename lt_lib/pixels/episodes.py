@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from lt_lib.envs.arena import HORIZON, Arena
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import NO_CORRIDOR, Layout, load_layout
-from lt_lib.perception.encoder import FrozenEncoder
+from lt_lib.perception.encoder import Frozen, FrozenEncoder
 from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.settings.pixels import BankConfig
 from lt_lib.settings.streams import Stream
@@ -35,6 +35,10 @@ class Outcomes(NamedTuple):
         """The team's undiscounted return: arrivals rewarded, slab contacts penalised, nothing else."""
         return ARRIVAL_REWARD * self.success + CONTACT_REWARD * self.contacts
 
+    def shaped(self, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+        """By name, as arrays of another shape."""
+        return {name: values.reshape(shape) for name, values in self._asdict().items()}
+
 
 class Draws(NamedTuple):
     """The random part of a scene besides the slab: spawn and scout poses, (E, 3) metres, metres, radians."""
@@ -42,40 +46,46 @@ class Draws(NamedTuple):
     spawn: Float[np.ndarray, "e 3"]
     scout: Float[np.ndarray, "e 3"]
 
+    def of(self, entry: Int[np.ndarray, " b"]) -> "Draws":
+        """Some of the draws, in any order and number."""
+        return Draws(self.spawn[entry], self.scout[entry])
+
 
 def draw_scenes(layout: Layout, n: int, rng: np.random.Generator) -> Draws:
     return Draws(layout.spawn.sample(n, rng), layout.scout.sample(n, rng))
 
 
 def drive(
-    layout: Layout,
-    encoder: FrozenEncoder,
+    arena: Arena,
+    camera: Any,
+    encoder: Frozen,
     executor: FrozenExecutor,
     draws: Draws,
     slab,
     route,
-    envs: int,
     commit_step: int,
     report: Callable[[float], None] = lambda _: None,
+    horizon: int = HORIZON,
 ) -> Outcomes:
-    """Drives E episodes, `envs` at a time, each from its draw to the goal or the time-out.
+    """Drives E episodes, as many at a time as the arena has scenes, each from its draw to the goal or the time-out.
 
+    camera       has the call of `FastCamera.frames`; the encoder takes what it returns
     slab, route  (E,) the placement of the slabs and the commanded corridor; with two of them, 0 left, 1 right
     commit_step  the navigator waits until this step, since no message can have told it where to go
+    horizon      control steps until the time-out
 
-    A batch always has `envs` rows, so that an episode's arithmetic does not depend on what runs beside it.
+    A batch always has as many rows, so that an episode's arithmetic does not depend on what runs beside it.
     """
-    arena, camera = Arena(layout, envs), FastCamera(layout)
-    seats, outcome = Seats(envs, len(slab)), none_yet(len(slab))
+    seats, outcome = Seats(arena.n, len(slab)), none_yet(len(slab))
     episode = seats.episode  # spare rows replay an episode and are not recorded
-    arena.reset(np.ones(envs, bool), draws.spawn[episode], slab[episode], draws.scout[episode])
+    arena.reset(np.ones(arena.n, bool), draws.spawn[episode], slab[episode], draws.scout[episode])
     while seats.live.any():
         latent = encoder.latent(camera.frames(arena.pose, arena.slab, arena.scout[:, :2]))
         action = executor.mean_action(latent, route[seats.episode])
         arena.step(np.where(seats.age[:, None] < commit_step, 0.0, action), seats.live)
         seats.age += 1
         record(outcome, arena, seats)
-        ended = seats.live & (arena.reached | (seats.age >= HORIZON))
+        ended = seats.live & (arena.reached | (seats.age >= horizon))
         if ended.any():
             fresh, episode = seats.pass_on(ended), seats.episode
             arena.reset(fresh, draws.spawn[episode], slab[episode], draws.scout[episode])
@@ -141,18 +151,17 @@ def roll_bank(
     shape = (config.entries, len(layout.placements), len(layout.routes))
     entry, slab, route = (axis.ravel() for axis in np.indices(shape))
     outcome = drive(
-        layout,
+        Arena(layout, config.envs),
+        FastCamera(layout),
         FrozenEncoder(encoder, device, config.precision),
         FrozenExecutor(executor, device),
-        Draws(draws.spawn[entry], draws.scout[entry]),
+        draws.of(entry),
         slab,
         route,
-        config.envs,
         config.commit_step,
         report,
     )
-    shaped = {name: values.reshape(shape) for name, values in outcome._asdict().items()}
-    return draws._asdict() | shaped | {"commit_step": config.commit_step, "held_out": config.held_out}
+    return draws._asdict() | outcome.shaped(shape) | {"commit_step": config.commit_step, "held_out": config.held_out}
 
 
 def obedience(bank: Mapping[str, Any]) -> float:

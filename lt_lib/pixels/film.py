@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import imageio.v3 as iio
 import numpy as np
@@ -13,7 +13,7 @@ from lt_lib.envs.arena import CONTROL_HZ, HORIZON, Arena
 from lt_lib.envs.camera import FastCamera, colours
 from lt_lib.envs.layout import Layout
 from lt_lib.envs.reference import TopView
-from lt_lib.perception.encoder import FrozenEncoder
+from lt_lib.perception.encoder import Frozen, FrozenEncoder
 from lt_lib.pixels.episodes import Draws
 from lt_lib.pixels.executor import FrozenExecutor
 from lt_lib.pixels.route import read_head, sent_wires
@@ -33,19 +33,24 @@ class Take(NamedTuple):
 
 def record(
     layout: Layout,
-    encoder: FrozenEncoder,
+    camera: Any,
+    encoder: Frozen,
     executor: FrozenExecutor,
     draws: Draws,
     entry: int,
     slab: int,
     route: int,
     commit_step: int,
+    horizon: int = HORIZON,
 ) -> Take:
-    """Drives one draw of the scene to the goal or the time-out, keeping the navigator's poses."""
-    arena, camera, scout = Arena(layout, 1), FastCamera(layout), draws.scout[entry : entry + 1]
+    """Drives one draw of the scene to the goal or the time-out, keeping the navigator's poses.
+
+    Arguments as for `pixels.episodes.drive`.
+    """
+    arena, scout = Arena(layout, 1), draws.scout[entry : entry + 1]
     arena.reset(np.ones(1, bool), draws.spawn[entry : entry + 1], np.array([slab]), scout)
     poses = [arena.pose[0]]
-    while not arena.reached[0] and len(poses) <= HORIZON:
+    while not arena.reached[0] and len(poses) <= horizon:
         latent = encoder.latent(camera.frames(arena.pose, arena.slab, scout[:, :2]))
         waiting = len(poses) <= commit_step
         arena.step(np.zeros((1, 3)) if waiting else executor.mean_action(latent, np.array([route])))
@@ -129,6 +134,6 @@ def film(
     """Films the first of some draws of the scene, under one placement of the slabs, with a head's greedy choice."""
     wire = sent_wires(layout, encoder, content, *draws, commit_step)[0, slab]
     route = int(read_head(head).policy(wire[None]).probs[0].argmax())
-    take = record(layout, encoder, executor, draws, 0, slab, route, commit_step)
+    take = record(layout, FastCamera(layout), encoder, executor, draws, 0, slab, route, commit_step)
     every = max(1, len(take.poses) // 40)
     return save_gif(path, pictures(layout, take, every, f"message: {content}"))

@@ -1,11 +1,12 @@
 """Settings of the experiments beyond the paper."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from lt_lib.settings.base import LATENCY, Settings, Share, Training
 from lt_lib.settings.gridworld import GridConfig, PatchEncoderConfig
+from lt_lib.settings.hardware import OpticsConfig
 from lt_lib.settings.perception import PictureConfig
 from lt_lib.settings.pixels import HeadConfig
 from lt_lib.settings.ppo import PpoConfig
@@ -102,6 +103,102 @@ class MovingConfig(MovingSizes, Training):
     decided = (*Training.decided, "content", "wire", "latency")
     content: str  # names in comm.messages.CONTENTS, joined by ' and '
     wire: str = "intact"  # a name in comm.channel.WIRES
+    latency: NonNegativeInt = LATENCY  # control steps
+
+
+Directions = Annotated[int, Field(ge=1, le=64)]
+Bits = Annotated[int, Field(ge=1, le=32)]
+Quality = Annotated[int, Field(ge=1, le=100)]
+Chance = Annotated[float, Field(ge=0, lt=1)]
+
+
+class CodeConfig(Settings):
+    """What is sent, and in how many bits."""
+
+    kind: Literal["latent", "oracle", "raw", "jpeg", "jpeg, encoded"] = "latent"
+    directions: Directions = 64  # principal ones of the latent; all 64: its own floats
+    bits: Bits = 32  # of each float of the latent; 32: the float itself
+    quality: Quality = 80  # of a JPEG
+
+
+class LinkConfig(Settings):
+    """How a message travels, and how long its receiver waits for it; the defaults are the paper's."""
+
+    loss: Chance = 0.0  # share of messages lost
+    memory: Chance = 0.0  # correlation of a message's fate with that of the one before
+    latency: NonNegativeInt = LATENCY  # control steps
+    reach: PositiveFloat | None = None  # metres; None: the layout's communication radius
+    noise: float | None = None  # dB of the content's power over that of the noise on it; None: no noise
+    patience: NonNegativeInt = 0  # control steps that the navigator waits for a message, beyond the commit step
+
+
+class RadioConfig(DeciderSizes, Training):
+    """Heads that read messages which travelled by radio."""
+
+    decided = (*Training.decided, "code", "link")
+    code: CodeConfig = CodeConfig()
+    link: LinkConfig = LinkConfig()
+
+
+class CrowdConfig(DeciderSizes, Training):
+    """Heads that hear several scouts, of which one sees the slab and one may lie."""
+
+    decided = (*Training.decided, "scouts", "liar", "latency")
+    scouts: PositiveInt = 1
+    liar: Literal["nobody", "elsewhere", "at the post"] = "nobody"
+    latency: NonNegativeInt = LATENCY  # control steps
+
+    @model_validator(mode="after")
+    def _room_for_a_liar(self) -> "CrowdConfig":
+        if self.liar != "nobody" and self.scouts < 2:
+            raise ValueError("a liar is a second scout; expected at least 2 scouts, got 1")
+        return self
+
+
+class LoopSizes(Settings):
+    """How many scenes are seen and driven behind a camera, and what the surrogate camera is like."""
+
+    draws: PositiveInt = 128  # of the scene, that scouts look at, under every placement
+    driven: PositiveInt = 15  # the first of them, which are driven too, under every placement and route
+    shards: PositiveInt = 3  # runs that driving is split into
+    rows: PositiveInt = 10  # episodes side by side
+    horizon: PositiveInt = 400  # control steps until the time-out
+    optics: OpticsConfig = OpticsConfig()
+    dim: NonNegativeFloat = 1.0  # stops by which the dim state's light is lowered, besides a lamp that is off
+
+    @model_validator(mode="after")
+    def _driven_are_seen(self) -> "LoopSizes":
+        if not self.shards <= self.driven <= self.draws:
+            raise ValueError(f"expected shards <= driven <= draws, got {self.shards}, {self.driven} and {self.draws}")
+        return self
+
+
+class SightConfig(Training):
+    """What scouts send who look through one eye."""
+
+    decided = (*Training.decided, "eye")
+    eye: Literal["simulated", "even", "bright", "dim"]
+    draws: PositiveInt
+    optics: OpticsConfig
+    dim: NonNegativeFloat  # stops
+
+
+class DrivingConfig(SightConfig):
+    """One shard of what navigators do who drive behind one eye."""
+
+    driven: PositiveInt
+    shards: PositiveInt
+    rows: PositiveInt
+    horizon: PositiveInt
+    commit_step: NonNegativeInt  # control steps that the navigator waits
+
+
+class LoopHeadConfig(DeciderSizes, Training):
+    """Heads that are trained on simulated frames, floor and walls recoloured or not."""
+
+    decided = (*Training.decided, "colour", "texture", "latency")
+    colour: Share = 0.0
+    texture: NonNegativeFloat = 0.0
     latency: NonNegativeInt = LATENCY  # control steps
 
 

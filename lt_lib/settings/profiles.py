@@ -7,10 +7,29 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+)
 
 from lt_lib.settings.base import ROOT, Share, UserError, refuse_decided, require_known
-from lt_lib.settings.beyond import ControlsConfig, DeciderSizes, MovingSizes, Rung
+from lt_lib.settings.beyond import (
+    Bits,
+    Chance,
+    ControlsConfig,
+    DeciderSizes,
+    Directions,
+    LoopSizes,
+    MovingSizes,
+    Quality,
+    Rung,
+)
 from lt_lib.settings.gridworld import GridworldConfig, Scaled
 from lt_lib.settings.hardware import MatchedEncoderConfig, MatchedGateConfig, RailsConfig, SessionsConfig
 from lt_lib.settings.learnability import Budget, PointMassConfig
@@ -223,4 +242,19 @@ SECTIONS: dict[str, Any] = {
     "commit_steps": Annotated[list[PositiveInt], Field(min_length=2)],
     "scout_counts": Annotated[list[PositiveInt], Field(min_length=2)],
     "rungs": Annotated[list[Rung], Field(min_length=1)],
+    "radio": DeciderSizes,
+    "widths": Annotated[list[Bits], _with([1, 4])],
+    "directions": Annotated[list[Directions], _with([64])],
+    "qualities": Annotated[list[Quality], Field(min_length=1)],
+    "losses": Annotated[list[Chance], _with([0.7])],
+    "memory": Chance,
+    "patience": PositiveInt,
+    "latencies": Annotated[list[NonNegativeInt], Field(min_length=2)],
+    "decibels": Annotated[list[float], _with([0.0])],
+    "reaches": Annotated[list[PositiveFloat], Field(min_length=1)],
+    "crowds": Annotated[list[PositiveInt], _with([1, 2, 4])],
+    "loop": LoopSizes,
+    "readers": DeciderSizes,
+    "candidate": str,
+    "driving_study": PixelsConfig,
 }

@@ -32,6 +32,9 @@ class Stream(IntEnum):
     READER = 19  # a head that reads a sender on a rung
     SENDER_GATES = 20
     LAYOUTS = 21
+    RADIO = 22  # scenes whose messages travel by radio, and what becomes of them on the way
+    CROWD = 23  # scenes with many senders
+    LOOP = 24  # episodes behind the surrogate camera
 
     def generator(self, seed: int, *condition: str) -> np.random.Generator:
         """The generator of this stream for a seed, and for a condition where several are compared."""
