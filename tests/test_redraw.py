@@ -96,7 +96,7 @@ def test_one_draw_an_episode_is_the_bank_s_episode_exactly(frozen, near):
     route = decisions.routes.numpy()
     assert 5 < route.sum() < 25
     encoder, executor, scene = FrozenEncoder(frozen.encoder), FrozenExecutor(frozen.executor), load_layout(near)
-    expected = drive(Arena(scene, ROWS), FastCamera(scene), encoder, executor, draws, slab, route, COMMIT_STEP)
+    expected = drive(Arena(scene, ROWS), FastCamera(scene), encoder, executor, draws, slab, route, COMMIT_STEP, SHORT)
     for name, values in expected._asdict().items():
         np.testing.assert_array_equal(getattr(outcome, name), values, err_msg=name)
     assert outcome.success.any() and not outcome.success.all()

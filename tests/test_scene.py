@@ -239,7 +239,7 @@ def test_arrival_slab_contact_and_time_out_are_told_apart(layout):
     draws = draw_scenes(layout, 3, np.random.default_rng(0))
     draws.spawn[:] = [[4.5, 0.0, 0.0], [0.4, 0.4, 0.0], [4.5, 0.0, 0.0]]
     slab, route = np.array([0, 0, 0]), np.array([0, 0, 1])
-    ended = drive(Arena(layout, 2), FastCamera(layout), Blind(), Straight(), draws, slab, route, 0)
+    ended = drive(Arena(layout, 2), FastCamera(layout), Blind(), Straight(), draws, slab, route, 0, HORIZON)
     assert ended.success.tolist() == [True, False, False]
     metres = layout.goal.x - layout.goal.radius - 4.5
     assert abs(ended.length[0] - metres / 0.05) <= 2

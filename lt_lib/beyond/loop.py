@@ -71,7 +71,7 @@ def look(config: SightConfig, seed: int, *, report: Callable[[float], None], enc
     )
     seen = []
     for i in range(config.draws):
-        scout, spawn = (np.tile(poses[i], (placements, 1)) for poses in draws)
+        scout, spawn = (np.tile(poses[i], (placements, 1)) for poses in (draws.scout, draws.spawn))
         seen.append(eye.frames(scout, np.arange(placements), spawn[:, :2]))
         report((i + 1) / config.draws)
     latents = network.latents(np.concatenate(seen)).reshape(config.draws, placements, -1)
@@ -100,8 +100,8 @@ def drive_behind(
         slab,
         route,
         config.commit_step,
-        report,
         config.horizon,
+        report,
     )
     return outcome.shaped(shape)
 

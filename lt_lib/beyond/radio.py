@@ -157,7 +157,7 @@ def train_radio(
     return states | chosen(heads, there, cut)
 
 
-def tested_radio(
+def evaluate_radio(
     config: RadioConfig,
     seed: int,
     *,
@@ -220,7 +220,7 @@ class RadioProtocol:
     ) -> dict[Any, Result]:
         """Frozen heads in each case."""
         inputs = {**inputs, "heads": {name: value for name, value in heads.items() if name[0].isdigit()}}
-        runs = [Run(tested_radio, self._config(case), SEED, inputs) for case in cases.values()]
+        runs = [Run(evaluate_radio, self._config(case), SEED, inputs) for case in cases.values()]
         return dict(zip(cases, self.pixels.store.fetch(runs, what), strict=True))
 
     def inputs(self) -> dict[str, Result]:

@@ -64,8 +64,8 @@ def drive(
     slab,
     route,
     commit_step: int,
+    horizon: int,
     report: Callable[[float], None] = lambda _: None,
-    horizon: int = HORIZON,
 ) -> Outcomes:
     """Drives E episodes, as many at a time as the arena has scenes, each from its draw to the goal or the time-out.
 
@@ -159,6 +159,7 @@ def roll_bank(
         slab,
         route,
         config.commit_step,
+        HORIZON,
         report,
     )
     return draws._asdict() | outcome.shaped(shape) | {"commit_step": config.commit_step, "held_out": config.held_out}
@@ -167,3 +168,8 @@ def roll_bank(
 def obedience(bank: Mapping[str, Any]) -> float:
     """Share of a bank's episodes in which the executor entered the commanded corridor."""
     return float((bank["entered"] == np.arange(bank["entered"].shape[-1])).mean())
+
+
+def arrival(bank: Mapping[str, Any], blocks: Bool[np.ndarray, "slab route"]) -> float:
+    """Share of a bank's episodes on free routes that reached the goal: what a head's reward can be, at best."""
+    return float(bank["success"][:, ~blocks].mean())
