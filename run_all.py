@@ -58,6 +58,7 @@ INPUTS = (
     "gate_file",
     "controls",
     "rungs",
+    "candidate",
 )
 # A notebook whose code calls this draws with OpenGL.
 DRAWS = "require_opengl()"
@@ -260,7 +261,7 @@ def execute_all(plan: Plan) -> dict[str, Outcome]:
         write_manifest(plan.outputs / "manifest.json", plan.root, plan.profile, {name: entry})
     judged = [name for name, outcome in outcomes.items() if outcome.status == "ok" and name >= "09"]
     if judged and (plan.outputs / "headline.md").exists():
-        from lt_lib.report.html import write_report  # takes seconds, which bad input need not wait for
+        from lt_lib.report.site import write_report  # takes seconds, which bad input need not wait for
 
         write_report(plan.outputs)
         if "09_scoreboard" in judged:

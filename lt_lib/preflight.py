@@ -25,8 +25,9 @@ def settled(parameters: Mapping[str, Any], root: Path = ROOT) -> dict[str, Any]:
 def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
     """Raises a one-line UserError for parameters that cannot work.
 
-    These are a missing device, an impossible or revealing layout, unusable weights, an unknown condition or camera
-    effect, an invalid gate file, a faulty folder of real frames, and a ladder without a rung that is predicted.
+    These are a missing device, an impossible or revealing layout, unusable weights, an unknown condition, camera effect
+    or encoder candidate, an invalid gate file, a faulty folder of real frames, and a ladder without a rung that is
+    predicted.
     """
     if "device" in parameters:
         from lt_lib.settings.devices import computing_device
@@ -53,6 +54,10 @@ def check_inputs(parameters: Mapping[str, Any], root: Path = ROOT) -> None:
         _check_gridworld(parameters)
     if "controls" in parameters:
         _check_controls(parameters)
+    if "candidate" in parameters:
+        from lt_lib.hardware.registration import read_gates
+
+        require_known([parameters["candidate"]], read_gates().candidates, "candidate", "candidate: ")
 
 
 def check_opengl() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import matplotlib
 import nbformat
 import numpy as np
+import pandas as pd
 import pytest
 from toy_project import COMPUTE, WRITE, smoke, write_notebook
 from toy_runs import ToyConfig, train_toy
@@ -21,9 +22,9 @@ from lt_lib.learnability.judgements import keep_curves
 from lt_lib.learnability.predictor import CURVES, Curve, load_curve
 from lt_lib.perception.weights import load_frozen, save_frozen
 from lt_lib.report.claims import Findings, load_claims
-from lt_lib.report.html import main as report, write_report
 from lt_lib.report.inferred import load_inferred
-from lt_lib.report.scoreboard import read_findings
+from lt_lib.report.scoreboard import COLUMNS, read_findings
+from lt_lib.report.site import main as report, write_report
 from lt_lib.settings.base import LAYOUTS, ROOT, UserError
 from lt_lib.settings.profiles import SECTIONS, load_profile, notebook_defaults, notebook_names
 from lt_lib.settings.strict_yaml import read_yaml
@@ -274,20 +275,20 @@ def outputs(tmp_path) -> Path:
     cell = nbformat.v4.new_code_cell("profile = '<script>alert(1)</script>'")
     cell.outputs = [nbformat.v4.new_output("stream", text="frames of <script>alert(2)</script>")]
     nbformat.write(nbformat.v4.new_notebook(cells=[cell]), folder / "notebooks" / "02_encoder.ipynb")
-    (folder / "scoreboard.md").write_text(
-        "# Scoreboard\n\n| id | note |\n|---|---|\n| a | <script>alert(3)</script> |\n"
-    )
-    entry = {"status": "<script>alert(4)</script>", "seconds": 1.0}
-    made = {"profile": "<script>alert(5)</script>", "notebooks": {"<i>x": entry}, "versions": {}, "machine": {}}
+    row = dict.fromkeys(COLUMNS, "") | {"id": "a", "notebook": "02_encoder", "note": "<script>alert(3)</script>"}
+    pd.DataFrame([row]).to_csv(folder / "scoreboard.csv", index=False)
+    (folder / "headline.md").write_text("<script>alert(4)</script>")
+    made = {"profile": "<script>alert(5)</script>", "versions": {"<i>x": 1}, "machine": {}}
     (folder / "manifest.json").write_text(json.dumps(made))
     return folder
 
 
 def test_no_name_or_parameter_becomes_a_script_of_the_report(outputs):
-    pages = [write_report(outputs), outputs / "report" / "02_encoder.html"]
-    for page in pages:
+    report = write_report(outputs).parent
+    for page in (report / f"{name}.html" for name in ("index", "scoreboard", "made", "notebooks/02_encoder")):
         text = page.read_text()
-        assert "alert" in text and "<script>alert" not in text and "<i>x" not in text
+        assert "<script>alert" not in text and "<i>x" not in text
+        assert "alert" in text or page.stem == "made"
 
 
 @pytest.mark.parametrize("file", ["manifest.json", "notebooks/02_encoder.ipynb"])
@@ -300,7 +301,7 @@ def test_a_truncated_file_is_named_by_the_report_command(outputs, file, capsys):
 
 
 def test_the_report_command_works_without_docstrings(outputs):
-    command = [sys.executable, "-OO", "-m", "lt_lib.report.html", "--outputs", str(outputs)]
+    command = [sys.executable, "-OO", "-m", "lt_lib.report.site", "--outputs", str(outputs)]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
 
 

@@ -1,4 +1,4 @@
-"""What people see in a browser, in a headless Chromium: the HTML report, and a notebook run in JupyterLab."""
+"""What people see in a browser, in a headless Chromium: the site, and a notebook run in JupyterLab."""
 
 import contextlib
 import json
@@ -9,13 +9,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote, urlparse
 
 import nbformat
+import pandas as pd
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 
-from lt_lib.report.html import PICTURES, main, write_report
 from lt_lib.report.readme import FULL
+from lt_lib.report.site import main, write_report
 from lt_lib.settings.base import ROOT
 
 pytestmark = pytest.mark.slow
@@ -24,11 +27,16 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 LIMIT_S = 600
 TOKEN = "of-this-test"
 NOTEBOOK = "09_scoreboard.ipynb"
-WITHOUT_CODE = "document.querySelectorAll('.jp-CodeCell .jp-Cell-inputWrapper').forEach(each => each.remove())"
+WITHOUT_CODE = "document.querySelectorAll('.cell_input').forEach(each => each.remove())"
 LATEX = re.compile(r"\$[^$\n]*[\\_^][^$\n]*\$")
-LOCAL = ("file", "data")
+LOCAL = ("file", "data", "blob")
 MISSING_PICTURES = "[...document.images].filter(i => !(i.complete && i.naturalWidth)).map(i => i.alt)"
 LINKS = "[...document.querySelectorAll('a[href]')].map(a => a.href)"
+IDS = "[...document.querySelectorAll('[id]')].map(e => e.id)"
+WIDTH = "document.documentElement.scrollWidth"
+SERIOUS = ("serious", "critical")
+HERE = {"preload": False}  # reads no style sheet anew, which a page from a file may not
+WINDOWS = {1300: "light", 390: "dark"}  # pixels wide
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +51,12 @@ def browser():
         chromium.close()
 
 
-# --- the report
+# --- the site
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> Path:
-    """The report of the committed full run, made in a copy of it."""
+    """The site of the committed full run, made in a copy of it."""
     if not (FULL / "scoreboard.md").exists():
         pytest.skip("no full run is committed")
     outputs = tmp_path_factory.mktemp("full")
@@ -56,63 +64,119 @@ def report(tmp_path_factory) -> Path:
     return write_report(outputs).parent
 
 
-def complaints_of(page) -> list[str]:
-    """What the page will say on its console, and what it will ask others for: a list that fills as it loads."""
-    found: list[str] = []
-    page.on("console", lambda message: found.append(message.text))
-    page.on("pageerror", lambda error: found.append(str(error)))
-    page.on("request", lambda sent: found.extend([sent.url] if urlparse(sent.url).scheme not in LOCAL else []))
+def pages_of(report: Path) -> list[str]:
+    """Every page that readers see."""
+    return sorted(str(path.relative_to(report)) for path in report.rglob("*.html") if path.parent.name[0] != "_")
+
+
+class Visit(NamedTuple):
+    """What a page was like in one window: console and requests, width, pictures that failed, faults, links, text."""
+
+    said: list[str]
+    width: int
+    missing: list[str]
+    faults: list[str]
+    links: list[str]
+    places: set[str]
+    pictures: int
+    text: str
+
+
+@contextlib.contextmanager
+def shown(browser, path: Path, width: int, scheme: str):
+    """A page as it looks at a width in light or dark, and what it says on its console or asks others for."""
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page, said = context.new_page(), []
+    page.on("console", lambda message: said.extend([message.text] if message.type in ("error", "warning") else []))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda sent: said.extend([sent.url] if urlparse(sent.url).scheme not in LOCAL else []))
+    page.goto(path.as_uri(), wait_until="load")
+    page.wait_for_timeout(300)
+    yield page, said
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def visits(browser, report) -> dict[tuple[str, int], Visit]:
+    """Every page in a wide light window and in a narrow dark one."""
+    found = {}
+    for name in pages_of(report):
+        for width, scheme in WINDOWS.items():
+            with shown(browser, report / name, width, scheme) as (page, said):
+                faults = [
+                    each for each in Axe().run(page, options=HERE).response["violations"] if each["impact"] in SERIOUS
+                ]
+                told = [f"{each['id']}: {each['nodes'][0]['html'][:150]}" for each in faults]
+                measures = [page.evaluate(each) for each in (WIDTH, MISSING_PICTURES)]
+                rest = page.evaluate(LINKS), set(page.evaluate(IDS)), page.locator(".bd-article img").count()
+                page.evaluate(WITHOUT_CODE)  # in which a figure's labels are formulas
+                found[name, width] = Visit(said, *measures, told, *rest, page.inner_text("main"))
     return found
 
 
-def pictures_of(page: str) -> int:
-    """How many pictures a page must have: the figures on the first one, a notebook's outputs on its own."""
-    if page == "index":
-        return sum(path.suffix in PICTURES for path in (FULL / "figures").iterdir())
-    cells = nbformat.read(FULL / "notebooks" / f"{page}.ipynb", as_version=4).cells
+def test_no_page_of_the_site_is_wider_than_its_window_or_says_or_loads_anything(visits):
+    assert {name: visit.said for (name, _), visit in visits.items() if visit.said} == {}
+    assert {name: visit.missing for (name, _), visit in visits.items() if visit.missing} == {}
+    assert {name: visit.width for (name, width), visit in visits.items() if visit.width > width} == {}
+
+
+def test_axe_finds_no_serious_fault_in_the_pages_around_the_notebooks(visits):
+    around = {name: visit.faults for (name, _), visit in visits.items() if not name.startswith("notebooks")}
+    assert len(around) > 8 and {name: faults for name, faults in around.items() if faults} == {}
+
+
+@pytest.mark.release
+def test_axe_finds_no_serious_fault_in_the_notebooks(visits):
+    assert {key: visit.faults for key, visit in visits.items() if visit.faults} == {}
+
+
+def test_all_links_of_the_site_resolve_to_a_file_and_a_place_in_it(visits, report):
+    places = {report / name: visit.places for (name, _), visit in visits.items()}
+    for (name, _), visit in visits.items():
+        for link in map(urlparse, visit.links):
+            if link.scheme == "file":
+                path = Path(unquote(link.path))
+                assert path.exists(), (name, link.path)
+                assert not link.fragment or path.suffix != ".html" or link.fragment in places[path], (name, link)
+
+
+def test_a_notebook_s_page_shows_its_pictures_and_no_formula_that_nothing_typesets(visits):
+    for path in (FULL / "notebooks").glob("*.ipynb"):
+        visit = visits[f"notebooks/{path.stem}.html", 1300]
+        assert visit.pictures >= pictures_of(path)
+        assert "<IPython.core.display" not in visit.text, "a picture shown as text"
+        assert not LATEX.search(visit.text), path.stem
+
+
+def pictures_of(path: Path) -> int:
+    """How many pictures a notebook's outputs have."""
+    cells = nbformat.read(path, as_version=4).cells
     outputs = [output for cell in cells for output in cell.get("outputs", [])]
-    return sum(bool({*PICTURES.values()} & {*output.get("data", {})}) for output in outputs)
+    return sum(bool({"image/png", "image/gif"} & {*output.get("data", {})}) for output in outputs)
 
 
-def test_report_shows_every_picture_loads_nothing_from_elsewhere_and_says_nothing_on_the_console(browser, report):
-    pages = sorted(report.glob("*.html"))
-    notebooks = {path.stem for path in (FULL / "notebooks").glob("*.ipynb")}
-    assert {path.stem for path in pages} == {"index", *notebooks}
-    for path in pages:
-        page = browser.new_page()
-        complaints = complaints_of(page)
-        page.goto(path.as_uri(), wait_until="load")
-        assert complaints == [], path.name
-        assert page.locator("script").count() == 0
-        assert page.evaluate("document.images.length") == pictures_of(path.stem), path.name
-        assert page.evaluate(MISSING_PICTURES) == [], path.name
-        page.evaluate(WITHOUT_CODE)  # in which a figure's labels are formulas
-        text = page.inner_text("body")
-        assert "<IPython.core.display" not in text, "a picture shown as text"
-        assert not LATEX.search(text), "a formula that nothing here typesets"
-        linked = [Path(unquote(urlparse(link).path)) for link in page.evaluate(LINKS)]
-        assert [link for link in linked if not link.exists()] == []
-        if path.stem == "index":
-            assert {link.stem for link in linked} >= notebooks
-        page.close()
+def test_the_scoreboard_is_searched_and_filtered_offline(browser, report):
+    with shown(browser, report / "scoreboard.html", 1300, "light") as (page, _):
+        board = pd.read_csv(FULL / "scoreboard.csv", keep_default_na=False)
+        page.wait_for_function("document.querySelectorAll('.dt-container .dt-info').length")
+        assert f"{len(board)} entries" in page.inner_text(".dt-info")
+        page.locator("input[type=search]").last.fill("peek")
+        page.wait_for_timeout(300)
+        told = page.inner_text(".dt-info")
+        assert f"filtered from {len(board)} total entries" in told and " of 0 " not in told
 
 
-def test_report_s_first_page_has_every_row_of_the_scoreboard_with_its_verdict_in_colour(browser, report):
-    page = browser.new_page()
-    page.goto((report / "index.html").as_uri())
-    text = (FULL / "scoreboard.md").read_text(encoding="utf-8")
-    rows = [line for line in text.splitlines() if line.startswith("|") and "verdict" not in line and "---" not in line]
-    cells = page.locator("td.verdict")
-    assert cells.count() == len(rows)
-    assert page.inner_text("h2#Scoreboard + p") == text.splitlines()[2].strip("*")
-    reproduced = cells.filter(has_text="✔ reproduced").first
-    assert reproduced.evaluate("cell => getComputedStyle(cell).color") == "rgb(0, 114, 178)"
+def test_the_front_page_answers_the_question_with_the_committed_numbers(visits):
+    text = visits["index.html", 1300].text
+    assert "What should the scout send?" in text and "Answer." in text
+    counts = (FULL / "headline.md").read_text(encoding="utf-8").splitlines()[-1]
+    assert counts in text and "What did not come out" in text
 
 
 def test_a_folder_without_outputs_is_refused_in_one_line(tmp_path, capsys):
     assert main(["--outputs", str(tmp_path)]) == 2
     out, err = capsys.readouterr()
-    assert (out, err) == ("", f"report: {tmp_path / 'scoreboard.md'} is missing; run_all.py writes it\n")
+    assert (out, err) == ("", f"report: {tmp_path / 'scoreboard.csv'} is missing; run_all.py writes it\n")
 
 
 # --- JupyterLab

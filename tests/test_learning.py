@@ -220,7 +220,14 @@ def test_bank_equals_live_episodes_whatever_runs_beside_them(encoder, executor, 
     entry, slab, route = (axis.ravel()[::-1] for axis in np.indices((4, 2, 2)))  # another order, other neighbours
     scene, crew = load_layout(str(path)), (FrozenEncoder(encoder), FrozenExecutor(executor))
     live = drive(
-        Arena(scene, 6), FastCamera(scene), *crew, Draws(bank["spawn"], bank["scout"]).of(entry), slab, route, 2, HORIZON
+        Arena(scene, 6),
+        FastCamera(scene),
+        *crew,
+        Draws(bank["spawn"], bank["scout"]).of(entry),
+        slab,
+        route,
+        2,
+        HORIZON,
     )
     for name, values in live._asdict().items():
         np.testing.assert_array_equal(bank[name][entry, slab, route], values)

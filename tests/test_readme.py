@@ -1,4 +1,4 @@
-"""The README's examples do what it says: its Python as printed, its diffs applied to a copy, its citation."""
+"""The examples of README and docs/ do what they say: Python as printed, diffs applied to a copy, the citation."""
 
 import re
 import runpy
@@ -15,7 +15,8 @@ from lt_lib.envs.layout import load_layout
 from lt_lib.report.readme import README
 from lt_lib.settings.base import ROOT
 
-TEXT = README.read_text(encoding="utf-8")
+PAGES = (README, *(ROOT / "docs" / f"{name}.md" for name in ("reuse", "extending")))
+TEXT = "\n\n".join(path.read_text(encoding="utf-8") for path in PAGES)
 PYTHON = {section: re.findall(r"```python\n(.*?)```", body, re.DOTALL) for section, body in
           re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", TEXT, re.DOTALL | re.MULTILINE)}  # fmt: skip
 DIFFS = dict(re.findall(r"^\*\*(?:A|An) ([\w ]+)\*\*.*?```diff\n(.*?)```", TEXT, re.DOTALL | re.MULTILINE))
@@ -154,15 +155,15 @@ assert learned("'same side' by hand") > 0.95 > 0.8 > learned("nothing")
 }
 
 
-def test_the_readme_shows_how_to_add_each():
+def test_the_pages_show_how_to_add_each():
     assert set(DIFFS) == set(PROOFS)
     assert all(len(diff.splitlines()) <= 30 for diff in DIFFS.values())
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("git") is None, reason="git applies the README's diffs, and is not installed here")
+@pytest.mark.skipif(shutil.which("git") is None, reason="git applies the diffs, and is not installed here")
 @pytest.mark.parametrize("what", PROOFS)
-def test_what_the_readme_adds_works(what, tmp_path):
+def test_what_the_pages_add_works(what, tmp_path):
     for name in NEEDED:
         source, target = ROOT / name, tmp_path / name
         target.parent.mkdir(parents=True, exist_ok=True)

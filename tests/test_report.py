@@ -17,7 +17,10 @@ from statsmodels.stats.weightstats import ttost_ind
 
 from lt_lib.report import forest, judges, scoreboard, stats
 from lt_lib.report.claims import Claim, Finding, Findings, load_claims, verdict
+from lt_lib.report.entries import read_entries
 from lt_lib.report.firmness import FRAGILE, firmness
+from lt_lib.report.front import NUMBER, TEMPLATES, filled
+from lt_lib.report.predictions import PREDICTIONS, Prediction
 from lt_lib.settings.base import ROOT, UserError
 
 EXACT = 1e-12  # closed forms and loops against floating point
@@ -622,3 +625,17 @@ def test_picture_of_a_smaller_profile_is_stamped_across():
     assert [text.get_text() for text in fig.texts[1:]] == ["SMOKE: not a result"] * 2
     fig.savefig(buffer := io.BytesIO(), dpi=20)
     assert buffer.tell() > 1000
+
+
+# --- pages with numbers from the results
+def test_a_template_takes_its_numbers_from_the_results_and_leaves_out_lines_that_have_none():
+    template = "**{{px.a:.1%}}**, paper {{paper px.a:.2f}}\n- {{cov.b[1]:.1f}} of two\n- {{rad.c}}\n| {{rad.c}} |"
+    assert filled(template, {"px.a": 0.5, "cov.b": [1, 2]}, {"px.a": 0.25}) == "**50.0%**, paper 0.25\n- 2.0 of two"
+    with pytest.raises(UserError, match="nothing was found for 'px.a'"):
+        filled(template, {}, {})
+
+
+def test_every_number_of_a_template_is_a_claim_or_a_prediction():
+    known = {*load_claims(), *read_entries(PREDICTIONS, Prediction, "id")}
+    for path in TEMPLATES.glob("*.md"):
+        assert {found["id"] for found in NUMBER.finditer(path.read_text(encoding="utf-8"))} <= known, path.name

@@ -233,11 +233,11 @@ def test_a_good_run_leaves_notebooks_results_logs_and_a_manifest(project, capfd)
 
 def test_a_scoreboard_is_summed_up_in_the_last_line(project, capfd):
     table = r'Path("outputs/smoke/headline.md").write_text("| a |\n\nOf 3 claims: 2 reproduced, 1 not run.\n")'
-    text = 'Path("outputs/smoke/scoreboard.md").write_text("# Scoreboard")'
+    text = 'Path("outputs/smoke/scoreboard.csv").write_text("id,notebook\\n")'
     write_notebook(project, "09_scoreboard", "results = []\nimport json\nfrom pathlib import Path", table, text, WRITE)
     assert smoke(project, "--only", "09") == 0
-    report = (project / "outputs" / "smoke" / "report" / "index.html").read_text()
-    assert 'href="09_scoreboard.html"' in report and "profile smoke" in report
+    report = project / "outputs" / "smoke" / "report"
+    assert "Profile smoke" in (report / "index.html").read_text() and (report / "notebooks/09_scoreboard.html").exists()
     assert capfd.readouterr().out.splitlines()[-1] == "scoreboard: Of 3 claims: 2 reproduced, 1 not run."
 
 

@@ -1,21 +1,44 @@
-"""Writes the headline table of the committed full run into README.md: `python -m lt_lib.report.readme`."""
+"""Writes what the committed full run found into README.md: `python -m lt_lib.report.readme`."""
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
+from lt_lib.report.front import page, table_three
 from lt_lib.settings.base import ROOT
 
 README = ROOT / "README.md"
 FULL = ROOT / "outputs" / "full"
-HEADLINE = re.compile(r"(<!-- headline: begin.*?-->\n).*?(<!-- headline: end -->)", re.DOTALL)
+
+
+def answer(outputs: Path) -> str:
+    """The paper's question answered, and Table III."""
+    return f"{page('answer', outputs)}\n\n{table_three(outputs)}"
+
+
+def learned(outputs: Path) -> str:
+    """What did not come out, what is new, the counts, and what computed them."""
+    counts = (outputs / "headline.md").read_text(encoding="utf-8").splitlines()[-1]
+    return f"{page('learned', outputs)}\n\n{counts}\n{computed_by(outputs)}"
+
+
+def notebooks(outputs: Path) -> str:
+    """Every notebook with its answer, linked to its executed copy."""
+    executed = outputs.relative_to(ROOT) / "notebooks" if outputs.is_relative_to(ROOT) else Path("notebooks")
+    return re.sub(r"\]\((\d\d_\w+)\)", rf"]({executed.as_posix()}/\1.ipynb)", page("notebooks", outputs))
+
+
+BLOCKS: dict[str, Callable[[Path], str]] = {each.__name__: each for each in (answer, learned, notebooks)}
 
 
 def refreshed(text: str, outputs: Path = FULL) -> str:
-    """The README's text with its headline block as notebook 9 left it with the results of the full run."""
-    written = (outputs / "headline.md").read_text(encoding="utf-8")
-    table = f"Route optimality by message content (Table III), mean over seeds [95% interval]:\n\n{written}"
-    return HEADLINE.sub(lambda found: f"{found[1]}{table}{computed_by(outputs)}\n{found[2]}", text)
+    """The README's text with its blocks as the results of the full run have them."""
+    for name, block in BLOCKS.items():
+        marked = re.compile(rf"(<!-- {name}: begin.*?-->\n).*?(<!-- {name}: end -->)", re.DOTALL)
+        written = block(outputs)
+        text = marked.sub(lambda found, written=written: f"{found[1]}{written}\n{found[2]}", text)
+    return text
 
 
 def computed_by(outputs: Path) -> str:

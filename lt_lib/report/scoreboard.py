@@ -278,7 +278,8 @@ def printed(value: Any, column: str = "") -> str:
 
 def styled(rows: pd.DataFrame, board: pd.DataFrame, profile: str) -> Styler:
     """Some rows of a board for display in a notebook, with coloured verdicts under the board's stamp."""
-    colours = {kind: f"color: {mark.colour}; font-weight: bold" for kind, mark in MARKS.items()}
+    # a coloured edge and not coloured letters, which would be hard to read on white or on black
+    colours = {kind: f"border-left: 5px solid {mark.colour}; font-weight: bold" for kind, mark in MARKS.items()}
     columns = ["id", "what", "paper", "ours", "n", "test", "p", "verdict", "note"]
     shown = [{name: _cell(row, name) for name in columns} for row in rows.to_dict("records")]
     cells = pd.DataFrame(shown, columns=columns)
