@@ -1,6 +1,6 @@
 """GIFs of one episode: the arena from above, the navigator's camera and the scout's, side by side."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,30 +94,6 @@ def save_gif(path: Path, frames: Sequence[UInt8[np.ndarray, "h w 3"]], seconds_a
     small = [np.asarray(Image.fromarray(f).quantize(32, dither=Image.Dither.NONE).convert("RGB")) for f in frames]
     iio.imwrite(path, small, duration=int(1000 * seconds_a_frame), loop=0)
     return path
-
-
-def film_pair(
-    layout: Layout,
-    heads: Mapping[str, Sequence[Result]],
-    bank: Result,
-    encoder: Result,
-    executor: Result,
-    commit_step: int,
-    folder: Path,
-) -> list[Path]:
-    """Films the first held-out draw once with the first latent head and once with the first floor head, greedily.
-
-    The slab is in the corridor that the floor's head prefers, so that the pair shows what the message contributes.
-    """
-    frozen, driver = FrozenEncoder(encoder), FrozenExecutor(executor)
-    draws = Draws(bank["spawn"][:1], bank["scout"][:1])
-    nothing = sent_wires(layout, frozen, "floor", *draws, commit_step)[0, 0]
-    slab = int(read_head(heads["floor"][0]).policy(nothing[None]).probs[0].argmax())
-    crew = frozen, driver, commit_step
-    return [
-        film(layout, heads[name][0], name, draws, slab, *crew, folder / "figures" / f"04_{name}.gif")
-        for name in ("floor", "latent")
-    ]
 
 
 def film(

@@ -32,18 +32,25 @@ def found_in(outputs: Path) -> dict[str, Any]:
     return values
 
 
-def filled(template: str, values: Mapping[str, Any], paper: Mapping[str, Any]) -> str:
+def filled(template: str, values: Mapping[str, Any], paper: Mapping[str, Any], missing: str | None = None) -> str:
     """A template with its numbers; lines of lists and tables that lack one are left out.
 
-    Raises UserError for any other line that lacks one.
+    missing  what stands for a number that was not computed
+
+    Raises UserError for any other line that lacks one, if nothing may stand for it.
     """
+
+    def told(found: re.Match) -> str:
+        known = paper if found["paper"] else values
+        return missing if missing and known.get(found["id"]) is None else _told(found, known)
+
     lines = []
     for line in template.splitlines():
         try:
-            lines.append(NUMBER.sub(lambda found: _told(found, paper if found["paper"] else values), line))
-        except KeyError as missing:
+            lines.append(NUMBER.sub(told, line))
+        except KeyError as lacking:
             if not line.startswith(("- ", "| ")):
-                raise UserError(f"template: nothing was found for {missing}, in '{line[:60]}'") from None
+                raise UserError(f"template: nothing was found for {lacking}, in '{line[:60]}'") from None
     return "\n".join(lines)
 
 
