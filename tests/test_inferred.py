@@ -12,7 +12,7 @@ from lt_lib.learnability.score_function import train_point_mass
 from lt_lib.report import stats
 from lt_lib.report.claims import CALIBRATED, NOT_REPRODUCED, Finding, load_claims, verdict
 from lt_lib.report.inferred import RECORD, Choice, calibrating_rows, load_inferred, registered
-from lt_lib.report.registration import register
+from lt_lib.report.registration import register, register_each
 from lt_lib.report.scoreboard import independent, join
 from lt_lib.settings.base import ROOT, UserError
 from lt_lib.settings.devices import computing_precision
@@ -117,6 +117,19 @@ def test_a_changed_file_is_told_and_a_broken_one_refused(tmp_path):
 
 
 # --- the settings themselves
+def test_every_prediction_is_registered_on_its_own(tmp_path):
+    record = tmp_path / "registered.json"
+    assert not register_each("predictions", {"a": b"1", "b": b"2"}, record).changed
+    later = register_each("predictions", {"a": b"1", "c": b"3"}, record)
+    assert not later.changed and set(later.first_use) == {"a", "c"} and "none changed since" in str(later)
+    moved = register_each("predictions", {"a": b"1", "c": b"4"}, record)
+    assert moved.changed == ["c"] and "CHANGED AFTER THE FACT" in str(moved)
+    record.write_text("[1]")
+    with pytest.raises(UserError, match="not a record of registered predictions") as error:
+        register_each("predictions", {"a": b"1"}, record)
+    assert "\n" not in str(error.value)
+
+
 def test_a_mean_score_is_a_sum_at_a_rate_divided_by_the_window():
     shared = {"window": 10, "seeds": 2, "optimiser": "sgd", "batch": 32, "budgets": (50,), "evaluation": 256}
     mean = train_point_mass(PointMassConfig(**shared, score="mean", lr=1.0), 0, report=lambda _: None)

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from lt_lib.report.claims import JUDGED
 from lt_lib.report.entries import parsed, read_entries
-from lt_lib.report.registration import Registration, register
+from lt_lib.report.registration import Registered, register_each
 from lt_lib.settings.base import ROOT, Settings, UserError
 from lt_lib.store.files import write_checked
 
@@ -102,8 +102,11 @@ class Predictions:
         return pd.DataFrame(rows, index=pd.Index(self.predicted, name="prediction"), columns=columns)
 
 
-def registered(notebook: str, outputs: Path) -> Registration:
-    """The checksum of a notebook's entries in predictions.yaml at their first use in an outputs folder, and now."""
-    entries = [entry.model_dump() for entry in read_entries(PREDICTIONS, Prediction, "id").values()]
-    own = json.dumps([entry for entry in entries if entry["nb"] == notebook], sort_keys=True)
-    return register("predictions", own.encode(), Path(outputs) / f"predictions_{notebook}.json")
+def registered(notebook: str, outputs: Path) -> Registered:
+    """Each of a notebook's entries in predictions.yaml at its first use in an outputs folder, and now."""
+    entries = {
+        name: json.dumps(entry.model_dump(), sort_keys=True).encode()
+        for name, entry in read_entries(PREDICTIONS, Prediction, "id").items()
+        if entry.nb == notebook
+    }
+    return register_each("predictions", entries, Path(outputs) / f"registered_{notebook}.json")

@@ -18,6 +18,7 @@ ROLES = {
 }  # fmt: skip
 CHANCE = {"color": "black", "ls": ":", "lw": 1.2, "zorder": 0}
 DPI = 130
+LETTERS = 11.5  # of a title per inch of width
 
 # A user's matplotlibrc, with its fonts, boxes or LaTeX, would change every figure of a notebook that imports this
 matplotlib.rcdefaults()
@@ -38,12 +39,14 @@ def plain(words: str) -> str:
     return re.sub(r"[${}]", "", words.replace(r"\hat{z}", "ẑ"))
 
 
-def finish(figure: Figure, profile: str, made_of: str, outputs: Path, name: str) -> Image:
-    """Captions a figure, stamps it if it is smoke-sized, saves it as a PNG and returns the image for display.
+def finish(figure: Figure, found: str, profile: str, made_of: str, outputs: Path, name: str) -> Image:
+    """Titles a figure with what was found, captions it, stamps it if it is smoke-sized, saves it as a PNG, returns it.
 
+    found    the finding in a sentence, its numbers computed
     made_of  what the figure shows, e.g. 'n = 5 seeds per condition, last 500 of 6,000 episodes'
     name     file name in <outputs>/figures, e.g. '04_routes'
     """
+    figure.suptitle(fill(found, int(LETTERS * figure.get_figwidth())), fontsize=12)
     figure.supxlabel(f"profile {profile}; {made_of}", fontsize=8, color="0.35")
     if profile != JUDGED:
         figure.text(
