@@ -31,6 +31,7 @@ from lt_lib.settings.beyond import DeciderConfig
 from lt_lib.settings.perception import EncoderConfig
 from lt_lib.settings.pixels import ExecutorConfig, HeadConfig
 from lt_lib.settings.profiles import SECTIONS, validated
+from lt_lib.store.runs import RunStore
 
 
 def quiet(_: float) -> None:
@@ -256,3 +257,32 @@ def test_every_message_has_a_width_that_fits(scenes):
             return np.zeros((len(pictures), 64))
 
     assert all(MESSAGES[name](few, Sixty()).shape[1] <= 64 for name in MESSAGES)
+
+
+def test_executors_are_those_weights_that_arrive_most_often_and_another_seed_is_trained_where_few_do(tmp_path):
+    protocol = DecisionProtocol.of({2: "corridors_2", 3: "corridors_3"}, {"executor": {"steps": 65_536}}, "cpu", 1)
+    sizes = protocol.protocols[3].sizes.executor
+    assert sizes.looks == (49_152, 57_344, 73_728, 81_920, 98_304) and sizes.steps == 98_304  # whole updates, half on
+    shares = {(2, 0): (0.0, 0.5, 0.2, 0.1, 0.1), (2, 1): (0.0, 0.0, 0.3, 0.3, 0.3), (2, 2): (0.0, 0.4, 0.4, 0.6, 0.0)}
+    shares[3, 0] = (0.2, 1.0, 1.0, 0.9, 0.0)
+    asked = []
+
+    class Store(RunStore):
+        def fetch(self, runs, what):
+            return [self.train(run) if what == "executors" else self.drive(run) for run in runs]
+
+        def train(self, run):
+            count = len(load_layout(run.config.layout).routes)
+            asked.append((count, run.seed))
+            return {f"{look}.share": s for look, s in zip(run.config.looks, shares[count, run.seed], strict=True)}
+
+        def drive(self, run):
+            blocks = load_layout(run.config.layout).blocks
+            arrived = np.arange(10)[:, None, None] < 10 * run.inputs["executor"]["share"]
+            return {"success": ~blocks & arrived}
+
+    for each in protocol.protocols.values():
+        object.__setattr__(each, "store", Store(tmp_path))
+    found = protocol.executors({2: {"ours": {}}, 3: {"ours": {}}})
+    assert {key: weights["share"] for key, weights in found.items()} == {2: 0.6, 3: 1.0}
+    assert asked == [(2, 0), (3, 0), (2, 1), (2, 2)]

@@ -35,7 +35,7 @@ class BankConfig(Training):
     """
 
     entries: PositiveInt = 256  # draws of spawn and scout pose
-    envs: PositiveInt = 64
+    envs: PositiveInt = 256  # episodes side by side
     commit_step: NonNegativeInt = 2  # control steps that the navigator waits
     held_out: Share = 0.125  # of the draws, kept for evaluation
     precision: Precision = "float32"
@@ -78,7 +78,7 @@ class RedrawConfig(Training):
     minibatch: PositiveInt = 64  # episodes' worth of draws; this and the rate are those of `HeadConfig`
     lr: PositiveFloat = 3e-3
     ppo: PpoConfig = PpoConfig()
-    envs: PositiveInt = 64
+    envs: PositiveInt = 256  # episodes side by side
     precision: Precision = "float32"
 
 
