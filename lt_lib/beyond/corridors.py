@@ -3,7 +3,8 @@
     python -m lt_lib.beyond.corridors      writes params/layouts/corridors_*.yaml again
 
 All corridors are alike, side by side, and bend the same way; the arena, the scout's distance and the goal's grow with
-their number, so that the scout still sees every slab. Any number of corridors can be blocked at a time.
+their number, so that the scout still sees every slab. Any number of corridors can be blocked at a time. Walls have no
+friction: what is asked is which corridor is chosen, and with friction a controller may stay in a bend for good.
 """
 
 import numpy as np
@@ -40,6 +41,7 @@ def corridor_layout(name: str) -> Layout:
         | {
             "name": name,
             "blocked": blocked,
+            "robot": values["robot"] | {"friction": 0.0},
             "arena": {"x": [values["arena"]["x"][0], cm(scout + 3.0)], "y": [cm(-outer), cm(outer)]},
             "corridors": [_corridor(near, far, mouth, out) for mouth, out in zip(mouths, exits, strict=True)],
             "scout": values["scout"] | {"x": cm(scout), "y": cm(middle)},
