@@ -219,9 +219,21 @@ class RadioProtocol:
         self, cases: Mapping[Any, Mapping], heads: Result, inputs: Mapping[str, Result], what: str
     ) -> dict[Any, Result]:
         """Frozen heads in each case."""
-        inputs = {**inputs, "heads": {name: value for name, value in heads.items() if name[0].isdigit()}}
-        runs = [Run(evaluate_radio, self._config(case), SEED, inputs) for case in cases.values()]
+        runs = self._tests(cases, heads, inputs)
         return dict(zip(cases, self.pixels.store.fetch(runs, what), strict=True))
+
+    def both_ways(
+        self, cases: Mapping[Any, Mapping], heads: Result, inputs: Mapping[str, Result], what: str
+    ) -> tuple[dict[Any, Result], dict[Any, Result]]:
+        """Heads trained in each case, and frozen heads that were trained intact; side by side."""
+        runs = [Run(train_radio, self._config(case), SEED, inputs) for case in cases.values()]
+        results = self.pixels.store.fetch([*runs, *self._tests(cases, heads, inputs)], what)
+        trained, tested = results[: len(cases)], results[len(cases) :]
+        return dict(zip(cases, trained, strict=True)), dict(zip(cases, tested, strict=True))
+
+    def _tests(self, cases: Mapping[Any, Mapping], heads: Result, inputs: Mapping[str, Result]) -> list[Run]:
+        inputs = {**inputs, "heads": {name: value for name, value in heads.items() if name[0].isdigit()}}
+        return [Run(evaluate_radio, self._config(case), SEED, inputs) for case in cases.values()]
 
     def inputs(self) -> dict[str, Result]:
         """The paper's bank and what its encoder needs to send."""
