@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -59,6 +60,16 @@ def test_every_notebook_leaves_results_figures_and_an_executed_copy(undisturbed)
         name[:2] for name in figures
     }
     assert "scoreboard.png" in figures
+
+
+def test_every_notebook_answers_on_its_first_screen_with_its_figure_and_says_that_it_is_no_result(undisturbed):
+    for name in notebook_names():
+        executed = undisturbed / "notebooks" / f"{name}.ipynb"
+        (cell,) = [cell for cell in json.loads(executed.read_text())["cells"] if cell.get("id") == "answer"]
+        text = "".join(cell["outputs"][0]["data"]["text/markdown"])
+        assert text.startswith("**Answer.** ") and "{{" not in text and "(profile smoke: not a result)" in text, name
+        (picture,) = re.findall(r"!\[.*\]\((.*)\)", text)
+        assert (executed.parent / picture).is_file(), name
 
 
 def test_the_scoreboard_has_every_claim_once_and_gives_no_verdict_at_smoke_size(undisturbed):
