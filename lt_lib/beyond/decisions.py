@@ -1,26 +1,21 @@
 """Decisions among C corridors: the paper's protocol in arenas of `beyond.corridors`, side by side."""
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 
+from lt_lib.beyond.crew import arriving_executors, with_looks
 from lt_lib.envs.layout import load_layout
 from lt_lib.perception.jepa import train_encoder
-from lt_lib.pixels.episodes import arrival, roll_bank
-from lt_lib.pixels.executor import train_executor
 from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
-from lt_lib.store.states import after
 
 UNTRAINED = "untrained"
-PARTS = 4  # that the second half of an executor's training is divided into, its weights kept at each end
-TRIED, TRIAL = 4, 1_000  # draws that each of them drives, and the seed of those draws, no shard of a bank
-SEEDS, ENOUGH = 3, 0.95  # trainings at most, and the share of arrivals that ends the search
 
 
 @dataclass(frozen=True)
@@ -58,37 +53,9 @@ class DecisionProtocol:
         return found
 
     def executors(self, encoders: Mapping[Any, Mapping[str, Result]]) -> dict[Any, Result]:
-        """The low-level controllers, each with a command per corridor: per arena, the weights that arrive most often.
-
-        A controller that explores may reach the goal long before its mean does, and the mean may lose the way again. So
-        weights are kept along the second half of a training, each drives a few draws that no bank has, and where even
-        the best seldom arrive, another seed is trained. No message plays a part in this.
-        """
-        best: dict[Any, tuple[float, Result]] = {}
-        for seed in range(SEEDS):
-            missing = [key for key in self.protocols if key not in best or best[key][0] < ENOUGH]
-            for key, found in self._tried(missing, encoders, seed).items():
-                best[key] = max(found, best.get(key, found), key=lambda each: each[0])
-        return {key: best[key][1] for key in self.protocols}
-
-    def _tried(
-        self, keys: Collection[Any], encoders: Mapping[Any, Mapping[str, Result]], seed: int
-    ) -> dict[Any, tuple[float, Result]]:
-        """Of one training per arena, how often its best weights arrive, and the weights."""
-        eyes = {key: encoders[key]["ours"] for key in keys}
-        sizes = {key: self.protocols[key].sizes for key in keys}
-        runs = [Run(train_executor, sizes[key].executor, seed, {"encoder": eyes[key]}) for key in keys]
-        trained = dict(zip(keys, self.store.fetch(runs, "executors"), strict=True))
-        kept = {(key, look): after(trained[key], look) for key in keys for look in sizes[key].executor.looks}
-        few = {key: sizes[key].bank.model_copy(update={"entries": TRIED}) for key in keys}
-        drives = [
-            Run(roll_bank, few[key], TRIAL, {"encoder": eyes[key], "executor": weights})
-            for (key, _), weights in kept.items()
-        ]
-        tried: dict[Any, list[tuple[float, Result]]] = {key: [] for key in keys}
-        for (key, _), weights, drive in zip(kept, kept.values(), self.store.fetch(drives, "trials"), strict=True):
-            tried[key].append((arrival(drive, load_layout(self.protocols[key].layout).blocks), weights))
-        return {key: max(each, key=lambda one: one[0]) for key, each in tried.items()}
+        """The low-level controllers, each with a command per corridor; see `beyond.crew`."""
+        eyes = {key: encoders[key]["ours"] for key in self.protocols}
+        return arriving_executors(self.store, self.protocols, eyes)
 
     def banks(self, encoders: Mapping[Any, Mapping[str, Result]], executors: Mapping[Any, Result]) -> dict[Any, Result]:
         """Every outcome of some draws of each arena: arrays (entries, placement, route)."""
@@ -125,10 +92,4 @@ def ceiling(blocks: Bool[np.ndarray, "placements routes"], bits: int) -> float:
 
 def _grown(pixel_study: Mapping[str, Any], name: str, device: str, workers: int | str) -> PixelProtocol:
     protocol = PixelProtocol.of(pixel_study, name, device, workers)
-    executor = protocol.sizes.executor
-    update, wanted = executor.envs * executor.rollout, executor.steps * len(load_layout(name).routes) // 2
-    looks = tuple(
-        sorted({max(1, wanted * part // (2 * PARTS) // update) * update for part in range(PARTS, 2 * PARTS + 1)})
-    )
-    grown = executor.model_copy(update={"steps": looks[-1], "looks": looks})
-    return replace(protocol, sizes=protocol.sizes.model_copy(update={"executor": grown}))
+    return with_looks(protocol, protocol.sizes.executor.steps * len(load_layout(name).routes) // 2)

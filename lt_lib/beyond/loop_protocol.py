@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from lt_lib.beyond.crew import arriving_executors, with_looks
 from lt_lib.beyond.loop import choices, drive_behind, look, loop_draws, loop_heads, loop_wires, train_loop_heads
 from lt_lib.beyond.senders import frozen
 from lt_lib.envs.layout import load_layout
 from lt_lib.hardware.matched import train_matched_encoder
 from lt_lib.hardware.registration import read_gates
 from lt_lib.pixels.episodes import Draws
-from lt_lib.pixels.executor import train_executor
 from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.settings.base import everywhere, require_known
 from lt_lib.settings.beyond import DeciderSizes, DrivingConfig, LoopHeadConfig, LoopSizes, SightConfig
@@ -54,7 +54,7 @@ class LoopProtocol:
         """
         known = read_gates().candidates
         require_known([candidate], known, "candidate", "candidate: ")
-        shared = {"layout": pixels.layout, "device": pixels.sizes.encoder.device}
+        shared = {"device": pixels.sizes.encoder.device}  # in the layout of notebook 08, with friction
         config = everywhere(validated(MatchedEncoderConfig, "matched", dict(matched)), shared)
         sizes, heads = validated(LoopSizes, "loop", dict(loop)), validated(DeciderSizes, "readers", dict(readers))
         return cls(sizes, heads, config, known[candidate], pixels)
@@ -70,10 +70,9 @@ class LoopProtocol:
         return dict(zip(configs, self.store.fetch(runs, "matched encoders"), strict=True))
 
     def executors(self, encoders: Mapping[str, Result]) -> dict[str, Result]:
-        """A controller behind each encoder, pretrained in plain simulation."""
-        config = self.pixels.sizes.executor
-        runs = [Run(train_executor, config, SEED, {"encoder": encoder}) for encoder in encoders.values()]
-        return dict(zip(encoders, self.store.fetch(runs, "executors"), strict=True))
+        """A controller behind each encoder, pretrained in plain simulation; see `beyond.crew`."""
+        protocol = with_looks(self.pixels, self.pixels.sizes.executor.steps)
+        return arriving_executors(self.store, dict.fromkeys(encoders, protocol), encoders)
 
     def readers(self, encoders: Mapping[str, Result], executors: Mapping[str, Result]) -> dict[tuple[str, str], Result]:
         """Heads by encoder and by the looks of the simulated frames that they learned from."""

@@ -1,0 +1,62 @@
+"""Controllers that arrive: of a few trainings, the weights whose mean command reaches the goal most often.
+
+A controller that explores may reach the goal long before its mean does, and the mean may lose the way again. So weights
+are kept along the second half of a training, each drives a few draws that no bank has, and where even the best seldom
+arrive, another seed is trained. No message plays a part in this.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from lt_lib.envs.layout import load_layout
+from lt_lib.pixels.episodes import arrival, roll_bank
+from lt_lib.pixels.executor import train_executor
+from lt_lib.pixels.protocol import PixelProtocol
+from lt_lib.store.run import Result, Run
+from lt_lib.store.runs import RunStore
+from lt_lib.store.states import after
+
+PARTS = 4  # that the second half of a training is divided into, the weights kept at each end
+TRIED, TRIAL = 4, 1_000  # draws that each of them drives, and the seed of those draws, no shard of a bank
+SEEDS, ENOUGH = 3, 0.95  # trainings at most, and the share of arrivals that ends the search
+
+
+def with_looks(protocol: PixelProtocol, steps: int) -> PixelProtocol:
+    """The protocol with an executor of about so many control steps whose weights are kept along the way."""
+    executor = protocol.sizes.executor
+    update = executor.envs * executor.rollout
+    looks = {max(1, steps * part // (2 * PARTS) // update) * update for part in range(PARTS, 2 * PARTS + 1)}
+    grown = executor.model_copy(update={"steps": max(looks), "looks": tuple(sorted(looks))})
+    return replace(protocol, sizes=protocol.sizes.model_copy(update={"executor": grown}))
+
+
+def arriving_executors(
+    store: RunStore, protocols: Mapping[Any, PixelProtocol], encoders: Mapping[Any, Result]
+) -> dict[Any, Result]:
+    """One executor per protocol, behind its encoder; the protocols come from `with_looks`."""
+    best: dict[Any, tuple[float, Result]] = {}
+    for seed in range(SEEDS):
+        missing = {key: each for key, each in protocols.items() if key not in best or best[key][0] < ENOUGH}
+        for key, found in _tried(store, missing, encoders, seed).items():
+            best[key] = max(found, best.get(key, found), key=lambda each: each[0])
+    return {key: best[key][1] for key in protocols}
+
+
+def _tried(
+    store: RunStore, protocols: Mapping[Any, PixelProtocol], encoders: Mapping[Any, Result], seed: int
+) -> dict[Any, tuple[float, Result]]:
+    """Of one training each, how often its best weights arrive, and the weights."""
+    sizes = {key: protocol.sizes for key, protocol in protocols.items()}
+    runs = [Run(train_executor, sizes[key].executor, seed, {"encoder": encoders[key]}) for key in sizes]
+    trained = dict(zip(sizes, store.fetch(runs, "executors"), strict=True))
+    kept = {(key, look): after(trained[key], look) for key in sizes for look in sizes[key].executor.looks}
+    few = {key: each.bank.model_copy(update={"entries": TRIED}) for key, each in sizes.items()}
+    drives = [
+        Run(roll_bank, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
+        for (key, _), weights in kept.items()
+    ]
+    tried: dict[Any, list[tuple[float, Result]]] = {key: [] for key in sizes}
+    for (key, _), weights, drive in zip(kept, kept.values(), store.fetch(drives, "trials"), strict=True):
+        tried[key].append((arrival(drive, load_layout(protocols[key].layout).blocks), weights))
+    return {key: max(each, key=lambda one: one[0]) for key, each in tried.items()}
