@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from PIL import Image, ImageSequence
 from pydantic import ValidationError
 
 from lt_lib.envs.arena import HORIZON, Arena, physics_xml
@@ -22,6 +23,8 @@ from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.perception.frames import free_poses
 from lt_lib.pixels.episodes import draw_scenes, drive
 from lt_lib.pixels.executor import FrozenExecutor
+from lt_lib.pixels.film import Take
+from lt_lib.pixels.pair import FIRST, LAST, _said, save_pair
 from lt_lib.settings.base import UserError, layout_path
 
 DEFAULT = yaml.safe_load(layout_path("default").read_text())
@@ -387,3 +390,19 @@ def test_a_blocked_route_is_named(layout):
         UserError, match="^layout mine: the goal cannot be reached from the spawn through the left corridor"
     ):
         RouteDistance(walled)
+
+
+def test_the_pair_holds_the_choice_and_says_how_each_episode_ends(layout, tmp_path):
+    path = np.column_stack([np.linspace(-3.0, 6.0, 60), np.zeros(60), np.zeros(60)])
+    stuck = np.tile(path[20], (HORIZON + 1, 1))
+    takes = {
+        "the scout sends its latent": Take(path, layout.scout.array, 0, 1),
+        "the scout sends nothing": Take(stuck, layout.scout.array, 0, 0),
+    }
+    first, second = takes.values()
+    assert _said(layout, first, 2, 2) == "0.2 s: the navigator chooses the right corridor"
+    assert _said(layout, first, HORIZON, 2) == "goal after 6 s"
+    assert _said(layout, second, HORIZON, 2) == "stuck: time-out after 60 s"
+    with Image.open(save_pair(layout, takes, 2, tmp_path / "pair.gif")) as film:
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(film)]
+    assert durations[0] == FIRST and durations[-1] == LAST and len(durations) > 10
