@@ -4,7 +4,6 @@ project = "Latent Telepathy, reproduced"
 author = "The Latent Telepathy compendium authors"
 language = "en"
 extensions = ["myst_nb"]
-exclude_patterns = ["templates"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
 nb_mime_priority_overrides = [("html", "image/gif", 5)]

@@ -14,7 +14,7 @@ UNKNOWN = "…"  # a number that was not computed
 
 
 class Answer:
-    """The place for the answer of one notebook, whose words are its row of docs/templates/notebooks.md."""
+    """The place for the answer of one notebook, whose words are its row of templates/notebooks.md."""
 
     def __init__(self, notebook: str):
         self.notebook = notebook

@@ -1,4 +1,4 @@
-"""Pages for readers whose numbers come from an outputs folder: templates in docs/ with `{{claim}}` in the text.
+"""Pages for readers whose numbers come from an outputs folder: templates with `{{claim}}` in the text.
 
 `{{px.latent.route:.3f}}` is what was found for a claim or a prediction, in Python's format; `{{cov.boost_early[0]}}`
 is the first of several; `{{paper px.latent.route:.3f}}` is what the paper prints. A line of a list or table whose
@@ -15,9 +15,9 @@ import pandas as pd
 
 from lt_lib.report.claims import load_claims
 from lt_lib.report.scoreboard import MARKS
-from lt_lib.settings.base import ROOT, UserError
+from lt_lib.settings.base import UserError
 
-TEMPLATES = ROOT / "docs" / "templates"
+TEMPLATES = Path(__file__).parent / "templates"
 NUMBER = re.compile(r"\{\{(?P<paper>paper )?(?P<id>[\w.]+?)(?:\[(?P<item>\d)\])?(?::(?P<format>[^}]+))?\}\}")
 SHOWN = ("latent", "predicted", "oracle", "raw", "floor", "zerowire", "position", "trajectory")  # of Table III
 
@@ -62,7 +62,7 @@ def _told(found: re.Match, values: Mapping[str, Any]) -> str:
 
 
 def page(name: str, outputs: Path) -> str:
-    """A template of docs/templates, filled for an outputs folder."""
+    """A template, filled for an outputs folder."""
     paper = {claim: entry.paper for claim, entry in load_claims().items()}
     return filled((TEMPLATES / f"{name}.md").read_text(encoding="utf-8"), found_in(outputs), paper)
 
