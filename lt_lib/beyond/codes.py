@@ -44,7 +44,12 @@ def latent(code: CodeConfig, view: View) -> Messages:
 
 
 def codec_of(code: CodeConfig, layout: Layout, encoder: PictureEncoder) -> Codec:
-    """Fitted on the latents of random rollouts in the scene, as the encoder was trained on, without label or reward."""
+    """Fitted on the latents of random rollouts in the scene, as the encoder was trained on, without label or reward.
+
+    The latent as it is needs no frames, and most links carry it so.
+    """
+    if (code.directions, code.bits) == (CONTENT, WIDEST):
+        return Codec(None, None, CONTENT)
     rollouts = random_rollouts(layout, *FITTED, Stream.RADIO.generator(0, "codec"))
     latents = encoder.latents(colours(rollouts.frames.reshape(-1, *rollouts.frames.shape[2:])))
     return fit_codec(latents, code.directions, code.bits)

@@ -115,10 +115,11 @@ def train_crowd(
     return {name: np.stack(values) for name, values in found.items()}
 
 
-@torch.no_grad()
 def _choice(
     network: StreamHead, shown: Float[Tensor, "n d"], free: Bool[np.ndarray, "n routes"], informed
 ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Whether greedy choices are right, and the attention on the informed scout."""
-    rows, route = np.arange(len(shown)), network.policy(shown).logits.argmax(1).numpy()
-    return free[rows, route], network.attention(shown).numpy()[rows, informed]
+    rows = np.arange(len(shown))
+    with torch.no_grad():
+        weights = network.attention(shown).numpy()
+    return free[rows, network.greedy(shown)], weights[rows, informed]

@@ -60,9 +60,7 @@ def train_deciders(
         network, course = learned(
             config, partial(RouteHead, wires.shape[1], rewards.shape[1]), wires[cut:], rewards[cut:], rng
         )
-        with torch.no_grad():
-            greedy = network.policy(wires[:cut]).logits.argmax(1).numpy()
-        found.append(rewards[np.arange(cut), greedy])
+        found.append(rewards[np.arange(cut), network.greedy(wires[:cut])])
         courses.append(course)
         report((head + 1) / config.heads)
     tested = rewards[:cut]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lt_lib.beyond.deciders import learned
@@ -65,17 +65,13 @@ def look(config: SightConfig, seed: int, *, report: Callable[[float], None], enc
     "pictures"  (slab, 64, 64, 3) of the first draw
     """
     draws, placements = loop_draws(config), len(load_layout(config.layout).placements)
-    eye, network = (
-        opened(config, Stream.LOOP.generator(seed, "sight", config.eye)),
-        PictureEncoder(encoder, config.device),
-    )
-    seen = []
+    eye, seen = opened(config, Stream.LOOP.generator(seed, "sight", config.eye)), []
     for i in range(config.draws):
         scout, spawn = (np.tile(poses[i], (placements, 1)) for poses in (draws.scout, draws.spawn))
         seen.append(eye.frames(scout, np.arange(placements), spawn[:, :2]))
         report((i + 1) / config.draws)
-    latents = network.latents(np.concatenate(seen)).reshape(config.draws, placements, -1)
-    return {"latents": latents, "pictures": seen[0]}
+    latents = PictureEncoder(encoder, config.device).latents(np.concatenate(seen))
+    return {"latents": latents.reshape(config.draws, placements, -1), "pictures": seen[0]}
 
 
 def drive_behind(
@@ -131,7 +127,7 @@ def train_loop_heads(
         own = Stream.READER.generator(i, "loop", f"{config.colour:g}", f"{config.texture:g}")
         head, _ = learned(config, partial(RouteHead, wires.shape[1], free.shape[1]), wires[cut:], rewards[cut:], own)
         states |= state_of(head, str(i))
-        greedy.append(free[np.arange(cut), choices(head, wires[:cut])])
+        greedy.append(free[np.arange(cut), head.greedy(wires[:cut])])
         report((i + 1) / config.heads)
     return states | {"greedy": np.stack(greedy)}
 
@@ -143,12 +139,6 @@ def loop_wires(
     channel = Channel((len(latents),), CONTENT, layout.communication_radius, latency)
     places = draws.scout[:, :2], draws.spawn[:, :2]
     return committed_wires(channel, commit_step, torch.from_numpy(latents).float(), *places)
-
-
-@torch.no_grad()
-def choices(head: RouteHead, wires: Float[Tensor, "n w"]) -> Int[np.ndarray, " n"]:
-    """Greedy routes."""
-    return head.policy(wires).logits.argmax(1).numpy()
 
 
 def loop_heads(trained: Mapping[str, Any], routes: int) -> list[RouteHead]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 
 from lt_lib.beyond.crew import arriving_executors, with_looks
-from lt_lib.beyond.loop import choices, drive_behind, look, loop_draws, loop_heads, loop_wires, train_loop_heads
+from lt_lib.beyond.loop import drive_behind, look, loop_draws, loop_heads, loop_wires, train_loop_heads
 from lt_lib.beyond.senders import frozen
 from lt_lib.envs.layout import load_layout
 from lt_lib.hardware.matched import train_matched_encoder
@@ -125,9 +125,8 @@ class LoopProtocol:
         scenes = self.draws().of(np.repeat(np.arange(draws), placements))
         timing = self.pixels.sizes.latency, self.pixels.sizes.bank.commit_step
         wires = loop_wires(layout, latents.reshape(draws * placements, -1), scenes, *timing)
-        return np.stack([choices(head, wires) for head in loop_heads(trained, len(layout.routes))]).reshape(
-            -1, draws, placements
-        )
+        heads = loop_heads(trained, len(layout.routes))
+        return np.stack([head.greedy(wires) for head in heads]).reshape(-1, draws, placements)
 
     def draws(self) -> Draws:
         """Of the scene, the same behind every eye."""

@@ -132,8 +132,7 @@ def train_moving(
     for head in range(config.heads):
         own = Stream.READER.generator(head, "moving", config.content, config.wire, *case)
         network, _ = learned(config, lambda: StreamHead(messages), observed[cut:], rewards[cut:], own)
-        with torch.no_grad():
-            greedy.append(network.policy(observed[:cut]).logits.argmax(1).numpy() != drives.slab[:cut])
+        greedy.append(network.greedy(observed[:cut]) != drives.slab[:cut])
         report((head + 1) / config.heads)
     return {"greedy": np.stack(greedy), "seeing": seeing[:cut]}
 

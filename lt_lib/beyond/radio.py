@@ -172,14 +172,13 @@ def evaluate_radio(
     return chosen([restored(RouteHead(width, routes), heads, str(i)) for i in range(config.heads)], there, cut)
 
 
-@torch.no_grad()
 def chosen(heads: list[RouteHead], there: Received, cut: int) -> dict[str, np.ndarray]:
     """Greedy choices in the first `cut` scenes, which no head was trained on.
 
     "greedy", "success", "length"  (heads, scenes): the free corridor, the goal reached, control steps
     "bits", "waited"               (scenes,) of the message;  "silent" (scenes,) whether none arrived
     """
-    routes = np.stack([head.policy(there.wires[:cut]).logits.argmax(1).numpy() for head in heads])
+    routes = np.stack([head.greedy(there.wires[:cut]) for head in heads])
     at = np.arange(cut), routes
     return {
         "greedy": there.free[at],
@@ -212,7 +211,7 @@ class RadioProtocol:
 
     def trained(self, cases: Mapping[Any, Mapping], inputs: Mapping[str, Result], what: str) -> dict[Any, Result]:
         """Heads trained in each case, `{"code": ..., "link": ...}` as far as it differs from the paper's."""
-        runs = [Run(train_radio, self._config(case), SEED, inputs) for case in cases.values()]
+        runs = self._trainings(cases, inputs)
         return dict(zip(cases, self.pixels.store.fetch(runs, what), strict=True))
 
     def tested(
@@ -226,10 +225,13 @@ class RadioProtocol:
         self, cases: Mapping[Any, Mapping], heads: Result, inputs: Mapping[str, Result], what: str
     ) -> tuple[dict[Any, Result], dict[Any, Result]]:
         """Heads trained in each case, and frozen heads that were trained intact; side by side."""
-        runs = [Run(train_radio, self._config(case), SEED, inputs) for case in cases.values()]
+        runs = self._trainings(cases, inputs)
         results = self.pixels.store.fetch([*runs, *self._tests(cases, heads, inputs)], what)
         trained, tested = results[: len(cases)], results[len(cases) :]
         return dict(zip(cases, trained, strict=True)), dict(zip(cases, tested, strict=True))
+
+    def _trainings(self, cases: Mapping[Any, Mapping], inputs: Mapping[str, Result]) -> list[Run]:
+        return [Run(train_radio, self._config(case), SEED, inputs) for case in cases.values()]
 
     def _tests(self, cases: Mapping[Any, Mapping], heads: Result, inputs: Mapping[str, Result]) -> list[Run]:
         inputs = {**inputs, "heads": {name: value for name, value in heads.items() if name[0].isdigit()}}

@@ -99,7 +99,6 @@ def read(
     return course["optimal"], greedy_choices(config, head, held_out, rng)
 
 
-@torch.no_grad()
 def greedy_choices(
     config: ReaderConfig, head: Chooser, held_out: Bank, rng: np.random.Generator
 ) -> Bool[np.ndarray, " scenes"]:
@@ -109,8 +108,7 @@ def greedy_choices(
     """
     entry, slab = (axis.ravel() for axis in np.indices(held_out.contents.shape[:2]))
     channel = channel_of(config, len(entry), held_out.contents.shape[-1], rng)
-    policy, _ = head.outlook(held_out.wires(channel, entry, slab))
-    return ~held_out.blocks[slab, policy.logits.argmax(1).numpy()]
+    return ~held_out.blocks[slab, head.greedy(held_out.wires(channel, entry, slab))]
 
 
 def probe(training: Float[Tensor, "e slab c"], held_out: Float[Tensor, "k slab c"]) -> float:

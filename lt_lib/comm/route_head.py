@@ -1,5 +1,6 @@
 """The route head: reads the wire, commits to one corridor (Section Route head and executor)."""
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -17,6 +18,11 @@ class Chooser(nn.Module):
 
     def policy(self, observations: Float[Tensor, "b d"]) -> torch.distributions.Categorical:
         return self.outlook(observations)[0]
+
+    @torch.no_grad()
+    def greedy(self, observations: Float[Tensor, "b d"]) -> Int[np.ndarray, " b"]:
+        """The likeliest route of each."""
+        return self.policy(observations).logits.argmax(1).numpy()
 
     def evaluate(self, observations: Float[Tensor, "b d"], actions: Int[Tensor, " b"]):
         """Log-probability, entropy and value, each (b,)."""

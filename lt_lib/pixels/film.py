@@ -88,11 +88,16 @@ def _captioned(picture, words: str, left: int) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(canvas)
 
 
-def save_gif(path: Path, frames: Sequence[UInt8[np.ndarray, "h w 3"]], seconds_a_frame: float = 0.08) -> Path:
-    """Writes a looping GIF of 32 colours."""
+def save_gif(
+    path: Path,
+    frames: Sequence[UInt8[np.ndarray, "h w 3"]],
+    milliseconds: int | Sequence[int] = 80,
+    colours: int = 32,
+) -> Path:
+    """Writes a looping GIF of few colours; milliseconds are of every frame, or of each."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    small = [np.asarray(Image.fromarray(f).quantize(32, dither=Image.Dither.NONE).convert("RGB")) for f in frames]
-    iio.imwrite(path, small, duration=int(1000 * seconds_a_frame), loop=0)
+    small = [np.asarray(Image.fromarray(f).quantize(colours, dither=Image.Dither.NONE).convert("RGB")) for f in frames]
+    iio.imwrite(path, small, duration=milliseconds, loop=0)
     return path
 
 

@@ -3,14 +3,12 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from PIL import Image
 
 from lt_lib.envs.arena import CONTROL_HZ, HORIZON
 from lt_lib.envs.camera import FastCamera
@@ -18,7 +16,7 @@ from lt_lib.envs.layout import Layout
 from lt_lib.perception.encoder import FrozenEncoder
 from lt_lib.pixels.episodes import Draws
 from lt_lib.pixels.executor import FrozenExecutor
-from lt_lib.pixels.film import Take, record
+from lt_lib.pixels.film import Take, record, save_gif
 from lt_lib.pixels.route import read_head, sent_wires
 from lt_lib.report import scene
 from lt_lib.store.run import Result
@@ -59,10 +57,7 @@ def save_pair(layout: Layout, takes: Mapping[str, Take], commit_step: int, path:
     ends = [len(take.poses) - 1 for take in takes.values()]
     steps = [commit_step, *range(PACE, min(ends), PACE), max(ends)]
     frames = [_picture(layout, takes, step, commit_step) for step in steps]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    small = [np.asarray(Image.fromarray(f).quantize(COLOURS, dither=Image.Dither.NONE).convert("RGB")) for f in frames]
-    iio.imwrite(path, small, duration=[FIRST, *[EACH] * (len(steps) - 2), LAST], loop=0)
-    return path
+    return save_gif(path, frames, [FIRST, *[EACH] * (len(steps) - 2), LAST], COLOURS)
 
 
 def _picture(layout: Layout, takes: Mapping[str, Take], step: int, commit_step: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -179,7 +179,6 @@ def learn(
     }
 
 
-@torch.no_grad()
 def evaluate(head: RouteHead, held_out: Bank, channel: Channel, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Greedy choices of a frozen head, one episode per sender of the channel, the slab placed at random.
 
@@ -187,7 +186,7 @@ def evaluate(head: RouteHead, held_out: Bank, channel: Channel, rng: np.random.G
     """
     n = channel.senders
     entry, slab = np.arange(n) % len(held_out.contents), rng.integers(0, held_out.contents.shape[1], n)
-    route = head.policy(held_out.wires(channel, entry, slab)).logits.argmax(1).numpy()
+    route = head.greedy(held_out.wires(channel, entry, slab))
     played = _played(held_out, entry, slab, route)
     played.pop("returns")
     return played | {"route": route}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from IPython.display import DisplayHandle, Markdown, display
 
-from lt_lib.report.claims import JUDGED, load_claims
-from lt_lib.report.front import TEMPLATES, filled, found_in
+from lt_lib.report.claims import JUDGED
+from lt_lib.report.front import TEMPLATES, filled, found_in, in_the_paper
 from lt_lib.settings.base import ROOT
 
 UNKNOWN = "…"  # a number that was not computed
@@ -33,5 +33,4 @@ def sentence(notebook: str, outputs: Path) -> str:
     """A notebook's answer in words, with the numbers of an outputs folder."""
     rows = (TEMPLATES / "notebooks.md").read_text(encoding="utf-8")
     words = re.search(rf"\]\({notebook}\) \| (.*) \|", rows)[1]
-    paper = {claim: entry.paper for claim, entry in load_claims().items()}
-    return filled(words, found_in(outputs), paper, UNKNOWN)
+    return filled(words, found_in(outputs), in_the_paper(), UNKNOWN)

@@ -63,8 +63,12 @@ def _told(found: re.Match, values: Mapping[str, Any]) -> str:
 
 def page(name: str, outputs: Path) -> str:
     """A template, filled for an outputs folder."""
-    paper = {claim: entry.paper for claim, entry in load_claims().items()}
-    return filled((TEMPLATES / f"{name}.md").read_text(encoding="utf-8"), found_in(outputs), paper)
+    return filled((TEMPLATES / f"{name}.md").read_text(encoding="utf-8"), found_in(outputs), in_the_paper())
+
+
+def in_the_paper() -> dict[str, Any]:
+    """What the paper prints, by claim."""
+    return {claim: entry.paper for claim, entry in load_claims().items()}
 
 
 def table_three(outputs: Path) -> str:

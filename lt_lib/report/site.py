@@ -32,7 +32,7 @@ ROOTED = {"ASSUMPTIONS.md": "assumptions", "CHANGELOG.md": "changelog", "HARDWAR
 REFERENCE = ("running", "scale", "reuse", "extending", *ROOTED.values())
 PICTURES = (".png", ".gif")
 FOLDED = ("parameters", "injected-parameters")  # tags of cells that readers need not see first
-FILM = "04_latent.gif"
+FILM = "04_pair.gif"
 STAMP = "**Profile {profile}: sizes that give no results.**"
 
 
@@ -134,7 +134,11 @@ def _relinked(text: str) -> str:
 def front(outputs: Path, profile: str, names: Sequence[str]) -> str:
     """The first page: the question, the film, the answer, what did not come out and what is new; then the contents."""
     shown = outputs / "figures" / FILM
-    film = f"![An episode: from above, the navigator's camera, the scout's](figures/{FILM})" if shown.exists() else ""
+    film = (
+        f"![One draw of the scene, with the scout's latent and without a message](figures/{FILM})"
+        if shown.exists()
+        else ""
+    )
     if profile == JUDGED:
         linked = re.sub(r"\]\([^)]*?(\d\d_\w+)\.ipynb\)", r"](notebooks/\1.ipynb)", notebooks(outputs))
         parts = [answer(outputs), learned(outputs), "## Every notebook in a sentence", linked]
