@@ -335,7 +335,7 @@ def test_interrupted_it_says_so_and_leaves_nothing_running(project, how, status)
 
 
 def test_stages_are_the_runs_that_the_journal_gained_for_whoever_asks(tmp_path, monkeypatch, caplog):
-    assert computed_since(tmp_path, 0, "us") == {"stages": {}, "computers": []}
+    assert computed_since(tmp_path, 0, "us") == {"stages": {}, "computers": [], "runs": []}
     monkeypatch.setenv(journal_file.ASKED_BY, "us")
     journal_file.append(tmp_path, {"function": "train", "seconds": 1.2})
     before = journal_file.length(tmp_path)
@@ -346,9 +346,11 @@ def test_stages_are_the_runs_that_the_journal_gained_for_whoever_asks(tmp_path, 
     with (tmp_path / journal_file.JOURNAL).open("a") as file:
         file.write('{"function": "train", "sec')  # the disk was full
     journal_file.append(tmp_path, {"function": "train", "seconds": 3.0})
-    journal_file.append(tmp_path, {"fetched": "heads", "computers": ["AMD EPYC", "Intel Xeon"]})
+    journal_file.append(
+        tmp_path, {"fetched": "heads", "computers": ["AMD EPYC", "Intel Xeon"], "runs": ["train/b", "train/a"]}
+    )
     made = computed_since(tmp_path, before, "us")
     assert made["stages"] == {"roll": {"runs": 1, "seconds": 2.0}, "train": {"runs": 1, "seconds": 3.0}}
-    assert made["computers"] == ["AMD EPYC", "Intel Xeon"]
+    assert made["computers"] == ["AMD EPYC", "Intel Xeon"] and made["runs"] == ["train/a", "train/b"]
     assert computed_since(tmp_path, 0, "us")["stages"]["train"] == {"runs": 2, "seconds": 4.2}
     assert "has a line that was cut short; it is skipped" in caplog.text

@@ -16,6 +16,9 @@ from pydantic import computed_field
 from toy_runs import ToyConfig, count_threads, lose_worker, train_toy
 
 from lt_lib.settings.base import UserError
+from lt_lib.store.files import kept_folder
+from lt_lib.store.kept import keep
+from lt_lib.store.manifest import computed_since, write_manifest
 from lt_lib.store.progress import Reporter, read_progress, stage, write_fraction
 from lt_lib.store.run import Run, pack, unpack
 from lt_lib.store.runs import RunError, RunStore
@@ -301,3 +304,78 @@ def test_a_reporter_tells_at_most_twice_a_second():
     for fraction in (0.1, 0.2, 0.3):
         report(fraction)
     assert told == [0.1]
+
+
+# --- what a release keeps
+
+
+@pytest.fixture
+def released(tmp_path):
+    """Folders of outputs, of the two finished runs that they used beside a third one, and of those kept."""
+    outputs, runs, kept = (tmp_path / name for name in ("outputs", "runs", "kept"))
+    (tmp_path / "requirements.txt").write_text("numpy==1.0\n")
+    store = RunStore(runs, 1, None)
+    store.fetch(toys(1), "toys")
+    store.fetch([Run(train_toy, ToyConfig(size=30_000), 0)], "cheap for its size")
+    used = computed_since(runs, 0, "")
+    store.fetch(toys(3)[2:], "not used")
+    write_manifest(
+        outputs / "manifest.json", tmp_path, "full", {"02_encoder": {"status": "ok", "seconds": 9.0, **used}}
+    )
+    return outputs, runs, kept
+
+
+def test_a_release_keeps_the_runs_that_were_used_and_are_worth_their_bytes_and_nothing_from_before(released):
+    outputs, runs, kept = released
+    old = kept / "train_toy" / "old.run.xz"
+    old.parent.mkdir(parents=True)
+    old.write_bytes(b"of an earlier release")
+    size = keep(outputs, runs, kept)
+    (path,) = kept.glob("*/*")
+    assert path.name == f"{toys(1)[0].key()}.run.xz" and path.stat().st_size == size
+
+
+def test_notebooks_opened_by_hand_read_the_runs_of_a_release_and_recompute_damaged_ones(released, tmp_path, caplog):
+    outputs, runs, kept = released
+    keep(outputs, runs, kept)
+    (expected,) = RunStore(runs, 1, None).fetch(toys(1), "toys")
+    (result,) = RunStore(tmp_path / "fresh", 1, kept).fetch(toys(1), "toys")
+    assert pack(result) == pack(expected) and not journal_keys(tmp_path / "fresh")
+    (path,) = kept.glob("*/*")
+    for damage in (path.read_bytes()[:-9], b"no archive"):
+        path.write_bytes(damage)
+        (result,) = RunStore(tmp_path / f"anew {len(damage)}", 1, kept).fetch(toys(1), "toys")
+        assert pack(result) == pack(expected) and len(journal_keys(tmp_path / f"anew {len(damage)}")) == 1
+    assert caplog.text.count("truncated or altered") == 2
+
+
+def test_run_all_does_not_see_what_a_release_keeps(tmp_path, monkeypatch):
+    monkeypatch.delenv("LT_RUNS", raising=False)
+    assert kept_folder(tmp_path) == tmp_path / "outputs" / "kept"
+    monkeypatch.setenv("LT_RUNS", str(tmp_path))
+    assert RunStore(tmp_path).kept is None
+
+
+def test_keeping_names_a_used_run_that_is_gone(released):
+    outputs, runs, kept = released
+    (runs / "train_toy" / f"{toys(1)[0].key()}.run").unlink()
+    with pytest.raises(UserError, match="lacks 1 runs that .*outputs used .train_toy/"):
+        keep(outputs, runs, kept)
+
+
+def test_an_execution_that_finds_all_its_runs_keeps_the_sitting_that_computed_them(released):
+    outputs, runs, _ = released
+
+    def entry(seconds, stages, used):
+        made = {"status": "ok", "seconds": seconds, "stages": stages, "computers": [], "runs": used}
+        write_manifest(outputs / "manifest.json", outputs.parent, "full", {"02_encoder": made})
+        return json.loads((outputs / "manifest.json").read_text())["notebooks"]["02_encoder"]
+
+    used = computed_since(runs, 0, "")["runs"][:2]
+    computed = {"train_toy": {"runs": 2, "seconds": 80.0}}
+    assert entry(90.0, computed, used)["sitting"] == {"commit": None, "seconds": 90.0, "stages": computed}
+    again = entry(3.0, {}, used)
+    assert again["seconds"] == 3.0 and again["sitting"]["seconds"] == 90.0
+    assert entry(2.0, {}, used[:1])["sitting"]["seconds"] == 2.0, "other runs, from who knows where"
+    assert entry(8.0, {}, [])["sitting"]["seconds"] == 8.0
+    assert entry(7.0, {}, [])["sitting"]["seconds"] == 7.0, "what uses no run is a sitting of its own"

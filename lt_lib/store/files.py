@@ -108,3 +108,11 @@ def runs_folder(root: Path = ROOT) -> Path:
     """Where finished runs are stored: the folder named by the environment's LT_RUNS, or the project's outputs/runs."""
     named = os.environ.get("LT_RUNS")
     return Path(named) if named else root / "outputs" / "runs"
+
+
+def kept_folder(root: Path = ROOT) -> Path | None:
+    """Where a release keeps runs for notebooks opened by hand; None where LT_RUNS names the only folder to look in.
+
+    `run_all.py` always names one, so that it computes from nothing.
+    """
+    return None if os.environ.get("LT_RUNS") else root / "outputs" / "kept"

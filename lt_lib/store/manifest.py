@@ -1,4 +1,8 @@
-"""What an outputs folder was made with: library versions, commit, machine, seconds per notebook and stage."""
+"""What an outputs folder was made with: library versions, commit, machine, seconds per notebook and stage.
+
+An execution that finds all its runs finished takes seconds. So that a figure can be drawn anew without the hours of a
+sitting from nothing, its entry keeps the seconds, stages and commit of the earlier one that computed these same runs.
+"""
 
 import json
 import logging
@@ -17,15 +21,24 @@ from lt_lib.store.computer import processor
 from lt_lib.store.files import write_atomically
 from lt_lib.store.journal import lines_since
 
+USED = "runs.json"  # beside the manifest: the runs that each notebook used
+
 
 def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str, Mapping[str, Any]]) -> None:
     """Writes the manifest; earlier entries of notebooks that did not run this time are kept.
 
-    notebooks: {name: {"status": text, "seconds": float, and as from `computed_since`}} of this time.
+    notebooks: {name: {"status": text, "seconds": float, and as from `computed_since`}} of this time; the names of the
+    runs go into `USED` beside the manifest.
     """
-    earlier = _notebooks_in(path)
-    commit = git_state(root)
-    executed = {name: dict(entry) | commit for name, entry in notebooks.items()}
+    earlier, used = _notebooks_in(path), used_runs(path.parent)
+    commit, executed = git_state(root), {}
+    for name, entry in notebooks.items():
+        entry = dict(entry) | commit
+        runs = entry.pop("runs", [])
+        same = runs and runs == used.get(name) and not entry["stages"]
+        own = {key: entry.get(key) for key in ("commit", "seconds", "stages")}
+        executed[name] = entry | {"sitting": earlier.get(name, {}).get("sitting", own) if same else own}
+        used[name] = runs
     manifest = {
         "profile": profile,
         "versions": versions(root / "requirements.txt"),
@@ -33,6 +46,17 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
         "notebooks": dict(sorted((earlier | executed).items())),
     }
     write_atomically(path, (json.dumps(manifest, indent=2) + "\n").encode())
+    write_atomically(path.with_name(USED), (json.dumps(dict(sorted(used.items())), indent=0) + "\n").encode())
+
+
+def used_runs(outputs: Path) -> dict[str, list[str]]:
+    """The names of the runs that each notebook of an outputs folder used; empty if none are known."""
+    path = outputs / USED
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
+    except (ValueError, TypeError):
+        logging.getLogger(__name__).warning("%s is damaged and will be rewritten", path)
+        return {}
 
 
 def _notebooks_in(path: Path) -> dict[str, Any]:
@@ -51,16 +75,19 @@ def computed_since(store: Path, position: int, asked_by: str) -> dict[str, Any]:
 
     "stages"     {function: {"runs": count, "seconds": total}}
     "computers"  that made the results which were used, newly computed or kept
+    "runs"       the names of those results' files
     """
     stages: dict[str, dict[str, int | float]] = {}
     computers: set[str] = set()
+    runs: set[str] = set()
     for line in lines_since(store, position, asked_by):
         computers |= set(line.get("computers", ()))
+        runs |= set(line.get("runs", ()))
         if "function" in line:
             stage = stages.setdefault(line["function"], {"runs": 0, "seconds": 0.0})
             stage["runs"] += 1
             stage["seconds"] = round(stage["seconds"] + line["seconds"], 1)
-    return {"stages": stages, "computers": sorted(computers)}
+    return {"stages": stages, "computers": sorted(computers), "runs": sorted(runs)}
 
 
 def versions(requirements: Path) -> dict[str, str]:

@@ -2,19 +2,22 @@
 
 import hashlib
 import logging
+import lzma
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 from lt_lib.store import journal
-from lt_lib.store.files import writable_folder, write_atomically
+from lt_lib.store.files import kept_folder, writable_folder, write_atomically
 from lt_lib.store.local import cores, local_workers
 from lt_lib.store.progress import stage
 from lt_lib.store.run import Packed, Result, Run, Submit, unpack
 from lt_lib.store.sources import source_state
+
+COMPRESSED = ".xz"  # the ending of a kept run's file
 
 
 class RunError(Exception):
@@ -27,10 +30,12 @@ class RunStore:
 
     workers: processes at a time on this machine, 0 for one per core; or a Dask scheduler's address, such as
     tcp://127.0.0.1:8786, for the workers of its cluster. Each has one thread, so results do not depend on the choice.
+    kept: a release's runs, compressed, which are read where the folder lacks them; see `store.kept`
     """
 
     folder: Path
     workers: int | str = 0
+    kept: Path | None = field(default_factory=kept_folder)
 
     def fetch(self, runs: Sequence[Run], what: str) -> list[Result]:
         """The results of `runs`, in order: finished ones are read, the others computed and stored.
@@ -48,7 +53,9 @@ class RunStore:
         if missing:
             self._compute(missing, what)
             kept |= {key: self._read(key, run) for key, run in missing.items()}
-        journal.append(self.folder, {"fetched": what, "computers": sorted({made_on for _, made_on in kept.values()})})
+        names = [self._path(key, run).relative_to(self.folder).as_posix() for key, run in wanted.items()]
+        made_on = sorted({made_on for _, made_on in kept.values()})
+        journal.append(self.folder, {"fetched": what, "runs": names, "computers": made_on})
         return [kept[key][0] for key in keys]
 
     def _path(self, key: str, run: Run) -> Path:
@@ -57,14 +64,23 @@ class RunStore:
     def _read(self, key: str, run: Run) -> tuple[Result, str] | None:
         """A finished run's result and the computer that made it; None if its file is missing or, warned of, damaged."""
         path = self._path(key, run)
-        if not path.exists():
-            return None
-        head, _, payload = path.read_bytes().partition(b"\n")
-        made_on = head.decode(errors="replace").split(" ", 2)[-1]
-        if head != _head(payload, made_on):
+        own = checked(path.read_bytes()) if path.exists() else None
+        if path.exists() and not own:
             logging.getLogger(__name__).warning("%s is truncated or altered; recomputing %s", path, run)
+        return own or self._released(path.relative_to(self.folder))
+
+    def _released(self, name: Path) -> tuple[Result, str] | None:
+        """As `_read`, of a run that the release keeps."""
+        path = self.kept / f"{name}{COMPRESSED}" if self.kept else None
+        if not path or not path.exists():
             return None
-        return unpack(payload), made_on
+        try:
+            found = checked(lzma.decompress(path.read_bytes()))
+        except (lzma.LZMAError, EOFError):
+            found = None
+        if not found:
+            logging.getLogger(__name__).warning("%s is truncated or altered; it is computed again", path)
+        return found
 
     def _compute(self, missing: Mapping[str, Run], what: str) -> None:
         """Has workers compute runs and stores each as soon as it is done."""
@@ -127,6 +143,13 @@ def fetch_by_name(
     for (name, _), result in zip(runs, fetch(list(runs.values()), what), strict=True):
         results.setdefault(name, []).append(result)
     return results
+
+
+def checked(content: bytes) -> tuple[Result, str] | None:
+    """The result in a run's file and the computer that made it; None if the file is truncated or altered."""
+    head, _, payload = content.partition(b"\n")
+    made_on = head.decode(errors="replace").split(" ", 2)[-1]
+    return (unpack(payload), made_on) if head == _head(payload, made_on) else None
 
 
 def _head(payload: bytes, made_on: str) -> bytes:
