@@ -70,12 +70,11 @@ def pages_of(report: Path) -> list[str]:
 
 
 class Visit(NamedTuple):
-    """What a page was like in one window: console and requests, width, pictures that failed, faults, links, text."""
+    """What a page was like in one window: console and requests, width, pictures that failed, links, text."""
 
     said: list[str]
     width: int
     missing: list[str]
-    faults: list[str]
     links: list[str]
     places: set[str]
     pictures: int
@@ -103,14 +102,10 @@ def visits(browser, report) -> dict[tuple[str, int], Visit]:
     for name in pages_of(report):
         for width, scheme in WINDOWS.items():
             with shown(browser, report / name, width, scheme) as (page, said):
-                faults = [
-                    each for each in Axe().run(page, options=HERE).response["violations"] if each["impact"] in SERIOUS
-                ]
-                told = [f"{each['id']}: {each['nodes'][0]['html'][:150]}" for each in faults]
                 measures = [page.evaluate(each) for each in (WIDTH, MISSING_PICTURES)]
                 rest = page.evaluate(LINKS), set(page.evaluate(IDS)), page.locator(".bd-article img").count()
                 page.evaluate(WITHOUT_CODE)  # in which a figure's labels are formulas
-                found[name, width] = Visit(said, *measures, told, *rest, page.inner_text("main"))
+                found[name, width] = Visit(said, *measures, *rest, page.inner_text("main"))
     return found
 
 
@@ -120,14 +115,25 @@ def test_no_page_of_the_site_is_wider_than_its_window_or_says_or_loads_anything(
     assert {name: visit.width for (name, width), visit in visits.items() if visit.width > width} == {}
 
 
-def test_axe_finds_no_serious_fault_in_the_pages_around_the_notebooks(visits):
-    around = {name: visit.faults for (name, _), visit in visits.items() if not name.startswith("notebooks")}
-    assert len(around) > 8 and {name: faults for name, faults in around.items() if faults} == {}
+def faults(browser, report: Path, names: list[str]) -> dict[tuple[str, int], list[str]]:
+    """What axe finds serious on pages, in both windows."""
+    found = {}
+    for name in names:
+        for width, scheme in WINDOWS.items():
+            with shown(browser, report / name, width, scheme) as (page, _):
+                serious = [v for v in Axe().run(page, options=HERE).response["violations"] if v["impact"] in SERIOUS]
+                found[name, width] = [f"{each['id']}: {each['nodes'][0]['html'][:150]}" for each in serious]
+    return {where: each for where, each in found.items() if each}
+
+
+def test_axe_finds_no_serious_fault_on_the_first_page(browser, report):
+    assert faults(browser, report, ["index.html"]) == {}
 
 
 @pytest.mark.release
-def test_axe_finds_no_serious_fault_in_the_notebooks(visits):
-    assert {key: visit.faults for key, visit in visits.items() if visit.faults} == {}
+def test_axe_finds_no_serious_fault_on_any_page(browser, report):
+    pages = pages_of(report)
+    assert len(pages) > 22 and faults(browser, report, pages) == {}
 
 
 def test_all_links_of_the_site_resolve_to_a_file_and_a_place_in_it(visits, report):

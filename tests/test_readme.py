@@ -148,7 +148,7 @@ quiet = lambda _: None
 blank = train_encoder(EncoderConfig(frames=640, epochs=0.0), 0, report=quiet)
 sender = {name: value for name, value in blank.items() if name[:2] == "E." or name in ("mean", "std")}
 def learned(message):
-    config = DeciderConfig(task="same side", message=message, scenes=2048, heads=1)
+    config = DeciderConfig(task="same side", message=message, scenes=2048, episodes=2000, heads=1)
     return train_deciders(config, 0, report=quiet, sender=sender)["reward"].mean()
 assert learned("'same side' by hand") > 0.95 > 0.8 > learned("nothing")
 """,

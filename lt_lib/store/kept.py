@@ -27,9 +27,7 @@ def keep(outputs: Path, runs: Path, kept: Path) -> int:
     """
     names = {name for used in used_runs(outputs).values() for name in used}
     if missing := sorted(name for name in names if not (runs / name).exists()):
-        raise UserError(
-            f"{runs} lacks {len(missing)} runs that {outputs} used ({missing[0]}); run_all.py makes them"
-        )
+        raise UserError(f"{runs} lacks {len(missing)} runs that {outputs} used ({missing[0]}); run_all.py makes them")
     seconds, total = run_seconds(runs), 0
     for name in sorted(names):
         path = kept / f"{name}{COMPRESSED}"
