@@ -8,7 +8,8 @@ import torch
 
 torch.set_num_threads(1)  # as in a run's worker; two would fight over the cores
 
-import lt_lib.envs.raycast  # compiled code, imported before the checks so that they leave it alone
+import lt_lib.envs.planar  # compiled code, imported before the checks so that they leave it alone
+import lt_lib.envs.raycast
 import lt_lib.gridworld.table_ppo
 import lt_lib.gridworld.walks
 import lt_lib.learnability.windows

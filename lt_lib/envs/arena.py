@@ -1,7 +1,8 @@
-"""The walled arena in MuJoCo (Section Setup), many navigators stepped together.
+"""The walled arena (Section Setup), many navigators stepped together by MuJoCo's equations.
 
-Physics runs at 60 Hz and control at 10 Hz. An action is a body-frame velocity (vx, vy, omega) in [-1, 1]^3, scaled
-to 0.5 m/s and 1.5 rad/s. The slab is solid, so a step in contact with it is a wasted step, not a shortcut.
+MuJoCo reads the scene and `planar` takes its steps. Physics runs at 60 Hz and control at 10 Hz. An action is a
+body-frame velocity (vx, vy, omega) in [-1, 1]^3, scaled to 0.5 m/s and 1.5 rad/s. The slab is solid, so a step in
+contact with it is a wasted step, not a shortcut.
 """
 
 from collections.abc import Mapping
@@ -9,8 +10,8 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from mujoco.batch import Batch
 
+from lt_lib.envs import planar
 from lt_lib.envs.layout import Box, Layout
 
 PHYSICS_HZ = 60
@@ -42,11 +43,9 @@ class Arena:
         self.layout = layout
         model = mujoco.MjModel.from_xml_string(physics_xml(layout))
         self.timestep = model.opt.timestep  # seconds of simulated time per physics step
-        self._batch = Batch(model, n, nthread=1)
-        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self._ctrl, self._mocap = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
-        self._warm = self._batch.bind("qacc_warmstart")
-        self._slab_centres = (layout.slabs[..., ::2] + layout.slabs[..., 1::2]) / 2  # (placements, slabs, 2)
+        self._mechanics = planar.mechanics(model)
+        self._boxes = planar.boxes(model, (layout.slabs[..., ::2] + layout.slabs[..., 1::2]) / 2)
+        self._qpos, self._qvel, self._time = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
         self.slab = np.zeros(n, np.int64)
         self.scout = np.tile(layout.scout.array, (n, 1))
 
@@ -57,7 +56,7 @@ class Arena:
     @property
     def time(self) -> Float[np.ndarray, " n"]:
         """Seconds of simulated time."""
-        return np.array(self._batch.bind("time")).reshape(-1)
+        return self._time.copy()
 
     @property
     def pose(self) -> Float[np.ndarray, "n 3"]:
@@ -71,26 +70,33 @@ class Arena:
         scout: Float[np.ndarray, "n 3"],
     ):
         """Starts new episodes in the scenes of `which`, with the slabs placed as `slab` says."""
-        self._qpos[which], self._qvel[which], self._warm[which] = pose[which], 0.0, 0.0
+        self._qpos[which], self._qvel[which] = pose[which], 0.0
         self.slab[which], self.scout[which] = slab[which], scout[which]
-        self._mocap[which, :-1, :2] = self._slab_centres[slab[which]]
-        self._mocap[which, -1, :2] = scout[which, :2]
         self._observe()
 
     def step(self, action: Float[np.ndarray, "n 3"], live: Bool[np.ndarray, " n"] | None = None):
         """Takes one control step of 0.1 s; actions are clipped to [-1, 1]. Scenes that are not `live` stand still."""
         vx, vy, turn = np.clip(action, -1.0, 1.0).T
         cos, sin = np.cos(self._qpos[:, 2]), np.sin(self._qpos[:, 2])
-        self._ctrl[:, 0] = V_MAX * (cos * vx - sin * vy)
-        self._ctrl[:, 1] = V_MAX * (sin * vx + cos * vy)
-        self._ctrl[:, 2] = W_MAX * turn
-        self._batch.step(None if live is None else np.flatnonzero(live), nstep=PHYSICS_HZ // CONTROL_HZ)
+        command = np.column_stack([V_MAX * (cos * vx - sin * vy), V_MAX * (sin * vx + cos * vy), W_MAX * turn])
+        planar.advance(
+            self._qpos,
+            self._qvel,
+            self._time,
+            command,
+            np.ones(self.n, bool) if live is None else live,
+            self.slab,
+            self.scout,
+            self._boxes,
+            self._mechanics,
+            PHYSICS_HZ // CONTROL_HZ,
+        )
         self._observe()
 
     def state(self) -> dict[str, np.ndarray]:
         """Every number that the next step depends on, to be given to `restore`, also in another process."""
-        parts = {"qpos": self._qpos, "qvel": self._qvel, "ctrl": self._ctrl, "mocap": self._mocap, "warm": self._warm}
-        return {name: np.array(values) for name, values in (parts | {"slab": self.slab, "scout": self.scout}).items()}
+        parts = {"qpos": self._qpos, "qvel": self._qvel, "slab": self.slab, "scout": self.scout}
+        return {name: values.copy() for name, values in parts.items()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Goes on from a `state` of an arena of the same layout and size.
@@ -100,9 +106,8 @@ class Arena:
         for name, values in self.state().items():
             if state[name].shape != values.shape or not np.isfinite(state[name]).all():
                 raise ValueError(f"state: {name} must be finite, of shape {values.shape}, got {state[name].shape}")
-        self._qpos[:], self._qvel[:], self._ctrl[:] = state["qpos"], state["qvel"], state["ctrl"]
-        self._mocap[:], self._warm[:] = state["mocap"], state["warm"]
-        self.slab, self.scout = state["slab"].copy(), state["scout"].copy()
+        self._qpos[:], self._qvel[:] = state["qpos"], state["qvel"]
+        self.slab[:], self.scout[:] = state["slab"], state["scout"]
         self._observe()
 
     def _observe(self):
