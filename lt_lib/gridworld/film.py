@@ -55,7 +55,7 @@ def _decide(inputs: Inputs, actor: Actor, row, loudness: float) -> Float[np.ndar
 
 def _message_decides(inputs: Inputs, actor: Actor, row) -> bool:
     """Whether the likeliest action is another one without the message's content."""
-    return _decide(inputs, actor, row, 1.0).argmax() != _decide(inputs, actor, row, 0.0).argmax()
+    return bool(_decide(inputs, actor, row, 1.0).argmax() != _decide(inputs, actor, row, 0.0).argmax())
 
 
 def _picture(grid: Grid, inputs: Inputs, actor: Actor, state: Sequence[int], step: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -79,9 +79,8 @@ def _picture(grid: Grid, inputs: Inputs, actor: Actor, state: Sequence[int], ste
     acts.invert_yaxis()
     acts.legend(fontsize=10, loc="upper center", bbox_to_anchor=(0.4, -0.12), ncols=2)
     decides = _message_decides(inputs, actor, row)
-    acts.set_title(
-        "the message decides" if decides else "the message changes nothing", color="#B22222" * decides or "0.3"
-    )
+    words, colour = ("the message decides", "#B22222") if decides else ("the message changes nothing", "0.3")
+    acts.set_title(words, color=colour)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
