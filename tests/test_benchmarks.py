@@ -1,13 +1,11 @@
-"""The instruments of notebook 10: turns, the power law of a cost, profiles."""
+"""The instruments of notebook 10: turns and profiles."""
 
 import time
 
-import numpy as np
-import pytest
 import torch
 
 from lt_lib.speed.benchmarks import BankCost
-from lt_lib.speed.turns import power_law, profile_call, taking_turns
+from lt_lib.speed.turns import profile_call, taking_turns
 
 
 def test_turns_alternate_and_the_first_round_is_not_counted():
@@ -32,15 +30,6 @@ def test_all_sides_are_timed_with_one_thread_as_in_a_worker():
     profile_call(lambda: threads.add(torch.get_num_threads()), 1)
     assert threads == {1} and torch.get_num_threads() == 2
     torch.set_num_threads(before)
-
-
-def test_the_exponent_of_a_power_law_is_found_with_an_interval_that_widens_with_noise():
-    slope, low, high = power_law({n: 3e-4 * n**1.5 for n in (1, 4, 16, 64)})
-    assert slope == pytest.approx(1.5) and low <= slope <= high and high - low < 1e-6
-    noisy = {1: 1.0, 4: 5.0, 16: 14.0, 64: 70.0}
-    slope, low, high = power_law(noisy)
-    expected, _ = np.polyfit(np.log(list(noisy)), np.log(list(noisy.values())), 1)
-    assert slope == pytest.approx(expected) and low < slope < high and high - low > 0.05
 
 
 def _busy():

@@ -119,7 +119,9 @@ def test_a_notebook_that_draws_is_refused_before_computing_and_one_that_does_not
 
 
 def test_a_notebook_says_that_it_draws_where_it_opens_a_camera_or_a_film():
-    drawing = re.compile(r"ReferenceCamera|TopView|pixels import .*film|step_costs|protocol\.surrogate\(\)")
+    drawing = re.compile(
+        r"ReferenceCamera|TopView|lt_lib\.pixels[.\w]* import .*film|step_costs|protocol\.surrogate\(\)"
+    )
     for name in notebook_names():
         code = "\n".join(code_cells(ROOT, name))
         assert bool(drawing.search(code)) == ("require_opengl()" in code), name

@@ -602,29 +602,41 @@ def test_headline_is_the_route_optimality_of_every_message(tmp_path, few):
     assert len(names) == 12
 
 
-def test_picture_shows_every_measured_number(tmp_path, few):
+def test_picture_of_a_notebook_shows_every_measured_number(tmp_path, few):
     write_encoder(tmp_path, few, value=0.8)
     write_pixels(tmp_path, few)
-    fig = forest.figure(make_board(tmp_path, few)[0], few, "full")
+    rows = forest.shown(make_board(tmp_path, few)[0], few)
+    assert list(rows.id) == ["e.probe", "px.latent.route", "px.range", "px.test", "px.zero"]
+    fig = forest.figure(rows, few, "full")
     upper, lower = ([label.get_text() for label in axes.get_yticklabels()] for axes in fig.axes)
-    assert [label.split()[-1] for label in upper] == (
-        ["02_encoder", "e.probe", "04_pixels", "px.latent.route", "px.range"]
-    )
-    assert [label.split()[-1] for label in lower] == ["04_pixels", "px.test", "px.zero"]
+    assert [len(upper), len(lower)] == [3, 2] and upper[0] == few["e.probe"].what
     marks = [line for line in fig.axes[0].lines if line.get_marker() == "D"]
     assert sorted(float(line.get_xdata()[0]) for line in marks) == [0.9, 0.98, 0.997, 1.0]
     colours = {line.get_marker(): line.get_color() for line in fig.axes[0].lines}
     assert colours["^"] == scoreboard.MARKS[SAME].colour
     assert [line.get_xdata()[0] for line in fig.axes[1].lines if line.get_marker() == ">"] == [forest.WIDEST] * 2
-    assert [text.get_text() for text in fig.texts] == [fig.get_suptitle()]
+    assert fig.texts == []
 
 
-def test_picture_of_a_smaller_profile_is_stamped_across():
-    board, _ = make_board(ROOT / "no such folder", load_claims(), "smoke")
-    fig = forest.figure(board, load_claims(), "smoke")
-    assert [text.get_text() for text in fig.texts[1:]] == ["SMOKE: not a result"] * 2
-    fig.savefig(buffer := io.BytesIO(), dpi=20)
-    assert buffer.tell() > 1000
+def test_overview_has_a_box_and_a_sign_for_every_independent_claim(tmp_path, few):
+    write_encoder(tmp_path, few, value=0.8)
+    write_pixels(tmp_path, few)
+    board, _ = make_board(tmp_path, few)
+    fig = forest.overview(board, "full")
+    signs = [text.get_text() for text in fig.axes[0].texts if text.get_color() == "white"]
+    assert sorted(signs) == sorted(scoreboard.MARKS[kind].sign for kind in scoreboard.independent(board).verdict)
+    assert len(fig.axes[0].patches) == len(signs)
+    assert [label.get_text().split()[0] for label in fig.axes[0].get_yticklabels()] == ["Encoder", "Rendered"]
+
+
+def test_pictures_of_a_smaller_profile_are_stamped_across():
+    claims = load_claims()
+    board, _ = make_board(ROOT / "no such folder", claims, "smoke")
+    rows = forest.shown(board, claims)
+    for fig in (forest.overview(board, "smoke"), forest.figure(rows[rows.notebook == "04_pixels"], claims, "smoke")):
+        assert [text.get_text() for text in fig.texts if text is not fig._suptitle] == ["SMOKE: not a result"]
+        fig.savefig(buffer := io.BytesIO(), dpi=20)
+        assert buffer.tell() > 1000
 
 
 # --- pages with numbers from the results

@@ -1,4 +1,4 @@
-"""GIF of one gridworld episode: the map, both fields of view, the attention, and what the message changes."""
+"""GIF of one gridworld episode: the map, both fields of view, and what the message changes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,58 +21,66 @@ from lt_lib.report.style import ROLES
 from lt_lib.store.run import Result
 
 LONGEST = 14  # pictures; a solved episode takes about 12
-ARROWS = ("stay", "right", "left", "up", "down")
+STEP_MS = 650  # on the screen; twice as long where the message changes what is done
+ARROWS = ("stay", "right", "left", "up", "down")  # on the map
 
 
 def film(grid: Grid, policy: Result, encoder: Result, content: str, start: int, slab: int, path: Path) -> Path:
     """Films a greedy episode from a spawn cell with the slab in one corridor; one picture per step."""
     inputs, actor = Inputs.of(grid, cells(grid, encoder), content), read_actor(policy)
-    cell, pictures = start, []
+    cell, pictures, told = start, [], []
     for step in range(LONGEST):
         message = 0 if step == 0 else 1 + len(grid.posts) // 2
         pictures.append(_picture(grid, inputs, actor, np.array([message, cell, slab]), step))
         if grid.goal[cell] or grid.slab[slab, cell]:
             break
-        probs, _ = _decide(inputs, actor, torch.tensor([[message, cell, slab]]), 1.0)
+        told.append(_message_decides(inputs, actor, torch.tensor([[message, cell, slab]])))
+        probs = _decide(inputs, actor, torch.tensor([[message, cell, slab]]), 1.0)
         cell = int(grid.following[cell, probs.argmax()])
     path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, pictures + [pictures[-1]] * 2, duration=650, loop=0)
+    held = [2 * STEP_MS if decides else STEP_MS for decides in told]
+    held += [STEP_MS] * (len(pictures) - len(held))
+    iio.imwrite(path, pictures, duration=[*held[:-1], 3 * STEP_MS], loop=0)
     return path
 
 
 @torch.no_grad()
-def _decide(inputs: Inputs, actor: Actor, row, loudness: float) -> tuple[Float[np.ndarray, "5"], float]:
-    """Action probabilities with the message's content scaled by `loudness`, and the attention it gets."""
+def _decide(inputs: Inputs, actor: Actor, row, loudness: float) -> Float[np.ndarray, "5"]:
+    """Action probabilities with the message's content scaled by `loudness`."""
     message, cell, slab = row.unbind(1)
     wires, present = inputs.wires(row)[:, None].clone(), inputs.present[message, cell][:, None]
     wires[..., inputs.anchors.shape[-1] :] *= loudness
-    own = inputs.own[cell, slab]
-    attention = actor.receiver.attention(actor.embed(own), wires, present)
-    return actor(own, wires, present).softmax(1)[0].numpy(), float(attention)
+    return actor(inputs.own[cell, slab], wires, present).softmax(1)[0].numpy()
+
+
+def _message_decides(inputs: Inputs, actor: Actor, row) -> bool:
+    """Whether the likeliest action is another one without the message's content."""
+    return bool(_decide(inputs, actor, row, 1.0).argmax() != _decide(inputs, actor, row, 0.0).argmax())
 
 
 def _picture(grid: Grid, inputs: Inputs, actor: Actor, state: Sequence[int], step: int) -> UInt8[np.ndarray, "h w 3"]:
-    figure = Figure(figsize=(11, 3.1), dpi=80, layout="constrained")
+    figure = Figure(figsize=(10, 3.3), dpi=80, layout="constrained")
     above, sees, sends, acts = figure.subplots(1, 4, width_ratios=(1.7, 1, 1, 1.1))
     message, cell, slab = (int(x) for x in state)
     post = grid.posts[len(grid.posts) // 2]
     board(above, grid, slab)
     above.plot(*grid.centres[cell], "o", color=NAVIGATOR, ms=10, mec="white")
     above.plot(*grid.centres[post], "s", color=SCOUT, ms=9, mec="white")
-    above.set_title(f"step {step}: slab {SIDES[slab]}", fontsize=9)
+    above.set_title(f"step {step}: slab {SIDES[slab]}", fontsize=12)
     patch(sees, grid.patches[cell, slab], NAVIGATOR, "navigator sees")
     patch(sends, grid.patches[post, slab], SCOUT, "scout sees, and sends")
     row = torch.tensor([[message, cell, slab]])
-    with_message, attention = _decide(inputs, actor, row, 1.0)
-    without, _ = _decide(inputs, actor, row, 0.0)
+    with_message, without = (_decide(inputs, actor, row, loudness) for loudness in (1.0, 0.0))
     places = np.arange(len(ARROWS))
-    acts.barh(places + 0.2, with_message, 0.38, color=ROLES["ours"], label="as it is")
-    acts.barh(places - 0.2, without, 0.38, color="0.75", label="content zeroed")
-    acts.set_yticks(places, ARROWS, fontsize=8)
+    acts.barh(places + 0.2, with_message, 0.38, color=ROLES["ours"], label="told")
+    acts.barh(places - 0.2, without, 0.38, color="0.75", label="not told")
+    acts.set_yticks(places, ARROWS, fontsize=10)
     acts.set(xlim=(0, 1.02))
     acts.invert_yaxis()
-    acts.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.45, -0.12), ncols=2)
-    acts.set_title(f"action probabilities; attention\non the message: {attention:.0f}", fontsize=9)
+    acts.legend(fontsize=10, loc="upper center", bbox_to_anchor=(0.4, -0.12), ncols=2)
+    decides = _message_decides(inputs, actor, row)
+    words, colour = ("the message decides", "#B22222") if decides else ("the message changes nothing", "0.3")
+    acts.set_title(words, color=colour)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -13,29 +13,29 @@ FROZEN, TRAINED, GRADIENT = "#DCE9F5", "#FDE9C9", "#B22222"
 
 def pipeline(layout: Layout) -> Figure:
     """Stage 1 (no labels, no reward) and stage 2 (the reward reaches only the route head)."""
-    figure = Figure(figsize=(12.5, 4.4), layout="constrained")
+    figure = Figure(figsize=(11, 3.9), layout="constrained")
     axes = figure.subplots()
     axes.set(xlim=(0, 12.5), ylim=(0, 4.4))
     axes.axis("off")
     pixels, width = layout.camera.pixels, channel.ANCHOR + messages.CONTENT
     boxes = {
         "frames": (0.1, 2.9, f"random rollouts\n{pixels}x{pixels} frames,\nno labels, no reward", "white"),
-        "jepa": (2.5, 2.9, "joint-embedding\nprediction +\nvariance, covariance", TRAINED),
-        "scout": (0.1, 0.5, "scout's frame\n(sees the slab)", "white"),
-        "E": (2.5, 0.5, f"encoder E, frozen\n{messages.CONTENT} floats", FROZEN),
+        "jepa": (2.5, 2.9, "joint-embedding\nprediction, variance,\ncovariance; auxiliary\nreconstruction", TRAINED),
+        "scout": (0.1, 0.5, "the scout's frame,\nwhich shows the slab", "white"),
+        "E": (2.5, 0.5, f"the scout's encoder,\nfrozen: {messages.CONTENT} floats", FROZEN),
         "wire": (
             4.9,
             0.5,
             f"wire: anchor {channel.ANCHOR}\n+ content {messages.CONTENT} = {width}\n{channel.LATENCY} step of latency",
             "white",
         ),
-        "head": (7.3, 0.5, "route head\ncommits once\nan episode", TRAINED),
-        "executor": (9.7, 0.5, "executor, frozen\nown view, route;\ncannot read the wire", FROZEN),
+        "head": (7.3, 0.5, "the navigator's\nroute head: one draw\nper episode", TRAINED),
+        "executor": (9.7, 0.5, "its executor, frozen:\nown view and route,\nnot the wire", FROZEN),
         "goal": (9.7, 2.9, "episode return:\n+1 arrival,\n-0.01 a contact step", "white"),
     }
     for x, y, text, colour in boxes.values():
         axes.add_patch(FancyBboxPatch((x, y), 1.9, 1.1, boxstyle="round,pad=0.06", fc=colour, ec="0.3"))
-        axes.text(x + 0.95, y + 0.55, text, ha="center", va="center", fontsize=9)
+        axes.text(x + 0.95, y + 0.55, text, ha="center", va="center", fontsize=10)
     for tail, head in (
         ("frames", "jepa"),
         ("scout", "E"),
@@ -54,13 +54,13 @@ def pipeline(layout: Layout) -> Figure:
         3.55,
         2.25,
         "gates, then freeze;\nsame copy on both robots",
-        fontsize=8,
+        fontsize=10,
         va="center",
         color=ROLES["ours"],
     )
     _arrow(axes, (10.65, 1.7), (10.65, 2.82), "0.2")
-    _arrow(axes, (9.62, 3.3), (8.25, 1.7), GRADIENT)
-    axes.text(7.5, 2.75, "the only gradient", fontsize=9, color=GRADIENT, ha="center")
+    _arrow(axes, (9.62, 3.45), (8.25, 1.7), GRADIENT)
+    axes.text(8.75, 2.7, "the only gradient ", fontsize=11, color=GRADIENT, ha="right", va="center")
     axes.text(0.1, 4.2, "Stage 1: perception", fontsize=11, weight="bold")
     axes.text(0.1, 1.85, "Stage 2: reward only", fontsize=11, weight="bold")
     for x, colour, text in ((5.1, TRAINED, "trained"), (6.3, FROZEN, "frozen")):

@@ -1,11 +1,12 @@
 """What encoders show in notebooks: the losses of their training, and whether their guards keep the rank up."""
 
-from collections.abc import Mapping
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lt_lib.perception.gates import effective_rank
@@ -17,22 +18,28 @@ from lt_lib.store.run import Result
 PARTS = 6  # groups of rollouts, each with an effective rank of its own
 
 
-def loss_curves(encoders: Mapping[str, Result]) -> Figure:
+TERMS = ("prediction", "variance", "covariance", "reconstruction")  # of the objective
+
+
+def loss_curves(whole: Result, rival: Result, name: str, trained: Collection[str]) -> Figure:
     """Each term of the objective, before weighting, against the update, on a log scale.
 
-    encoders  two results by name: ours first, then its rival; each has "loss.*" (updates,)
+    whole, rival  trainings by all TERMS and by some; each has "loss.*" (updates,)
+    trained       the terms of the rival's objective; the others are dashed, since nothing lowers them
     """
-    terms = ("prediction", "variance", "covariance", "reconstruction")
-    figure = Figure(figsize=(13, 3.2), layout="constrained")
-    for axes, term in zip(figure.subplots(1, len(terms)), terms, strict=True):
-        for (name, encoder), role in zip(encoders.items(), ("ours", "upper bound"), strict=True):
-            values = np.maximum(encoder[f"loss.{term}"], 1e-8)  # a log axis has no zero
-            smooth = pd.Series(values).rolling(10, min_periods=1).mean()
-            axes.semilogy(smooth.index, smooth, color=ROLES[role], lw=1.2, label=name)
-        axes.set(title=term, xlabel="update")
-    axes.legend(fontsize=8)
+    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    for axes, term in zip(figure.subplots(1, len(TERMS)), TERMS, strict=True):
+        _curve(axes, whole[f"loss.{term}"], "ours", "-", "the whole objective")
+        _curve(axes, rival[f"loss.{term}"], "upper bound", "-" if term in trained else "--", name)
+        axes.set(title=term if term in trained else f"{term}\n(dashed: not in its objective)", xlabel="update")
+    figure.axes[0].legend()
     figure.supylabel("loss, mean of 10 updates")
     return figure
+
+
+def _curve(axes: Axes, loss: Float[np.ndarray, " updates"], role: str, dash: str, name: str) -> None:
+    smooth = pd.Series(np.maximum(loss, 1e-8)).rolling(10, min_periods=1).mean()  # a log axis has no zero
+    axes.semilogy(smooth.index, smooth, color=ROLES[role], ls=dash, lw=1.2, label=name)
 
 
 def rank_falls(

@@ -7,7 +7,7 @@ from pydantic import Field, PositiveInt
 from lt_lib.settings.base import Settings
 from lt_lib.settings.learnability import Budget
 
-Sizes = Annotated[tuple[PositiveInt, ...], Field(min_length=3)]  # points of a fitted slope
+Sizes = Annotated[tuple[PositiveInt, ...], Field(min_length=3)]  # from the smallest to the largest
 
 
 class Stretch(Settings):

@@ -1,18 +1,22 @@
-"""How much faster the fast camera is than `mujoco.Renderer` (Section Setup)."""
+"""How much faster the fast camera is than MuJoCo's renderers (Section Setup)."""
 
 import numpy as np
 from jaxtyping import Float
 
 from lt_lib.envs.camera import FastCamera, network_input
 from lt_lib.envs.reference import ReferenceCamera
+from lt_lib.envs.warp_camera import WarpCamera
 from lt_lib.speed.turns import taking_turns
 
-BATCH, SLOW_BATCH = 256, 32  # frames per turn: as many as training requests at once, and fewer for the slow renderer
+BATCH = 256  # frames per turn, as many as training requests at once
+WORLDS = 64  # likewise for MuJoCo Warp, whose camera draws as many scenes at a time
+FEW = 32  # likewise for the slow renderer
 
 
 def frame_rates(
     fast: FastCamera,
     reference: ReferenceCamera,
+    warp: WarpCamera,
     eyes: Float[np.ndarray, "b 3"],
     slabs,
     others: Float[np.ndarray, "b 2"],
@@ -21,12 +25,17 @@ def frame_rates(
     """Frames per second of processor time: the median over rounds in which the cameras take turns.
 
     Processor time includes all threads of this process, so these are rates of one core. A renderer on a GPU would hide
-    its work from this clock. Arguments as for `FastCamera.frames`.
+    its work from this clock.
+
+    warp  draws WORLDS scenes at a time; other arguments as for `FastCamera.frames`
     """
-    scenes = [values[np.arange(BATCH) % len(eyes)] for values in (eyes, np.asarray(slabs), others)]
-    few = [values[:SLOW_BATCH] for values in scenes]
+    scenes, several, few = (
+        [values[np.arange(count) % len(eyes)] for values in (eyes, np.asarray(slabs), others)]
+        for count in (BATCH, WORLDS, FEW)
+    )
     draws = {
-        "mujoco.Renderer": (SLOW_BATCH, lambda: reference.pictures(*few)),
+        "mujoco.Renderer": (FEW, lambda: reference.pictures(*few)),
+        "MuJoCo Warp, on the CPU": (WORLDS, lambda: warp.frames(*several)),
         "fast camera": (BATCH, lambda: fast.frames(*scenes)),
         "fast camera, expanded to the network's input": (BATCH, lambda: network_input(fast.frames(*scenes))),
     }

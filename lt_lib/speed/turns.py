@@ -1,4 +1,4 @@
-"""Instruments of notebook 10: calls timed in turns, the power law of their cost, the profile of one call."""
+"""Instruments of notebook 10: calls timed in turns, the profile of one call."""
 
 import contextlib
 import cProfile
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from scipy import stats
 
 
 @contextlib.contextmanager
@@ -44,13 +43,6 @@ def taking_turns(
                 if turn:
                     seconds[name].append(clock() - start)
     return {name: float(np.median(values)) for name, values in seconds.items()}
-
-
-def power_law(seconds: Mapping[int, float]) -> tuple[float, float, float]:
-    """Exponent of the power law through seconds by size, with its 95% interval (Student's t of the log-log slope)."""
-    line = stats.linregress(np.log(list(seconds)), np.log(list(seconds.values())))
-    reach = line.stderr * stats.t.ppf(0.975, len(seconds) - 2)
-    return float(line.slope), float(line.slope - reach), float(line.slope + reach)
 
 
 def profile_call(call: Callable[[], Any], most: int) -> pd.DataFrame:
