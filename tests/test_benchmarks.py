@@ -2,9 +2,14 @@
 
 import time
 
+import numpy as np
 import torch
 
+from lt_lib.envs.arena import Arena
+from lt_lib.envs.layout import load_layout
+from lt_lib.perception.frames import free_poses
 from lt_lib.speed.benchmarks import BankCost
+from lt_lib.speed.step import mujoco_step
 from lt_lib.speed.turns import profile_call, taking_turns
 
 
@@ -47,3 +52,16 @@ def test_a_profile_names_the_function_that_takes_the_time_first():
 def test_the_bank_pays_after_its_own_price():
     price = BankCost(bank=100.0, head=1.0, live=60.0)
     assert price.heads(1) == (101.0, 60.0) and price.heads(10) == (110.0, 600.0)
+
+
+def test_mujoco_s_side_of_the_physics_takes_the_same_step():
+    layout, rng = load_layout("default"), np.random.default_rng(0)
+    arena, n = Arena(layout, 32), 32
+    slab, scout = rng.integers(0, 2, n), layout.scout.sample(n, rng)
+    arena.reset(np.ones(n, bool), free_poses(layout, slab, rng, apart_from=scout), slab, scout)
+    arena.reset(slab == 0, np.tile([0.752, 0.4, 0.3], (n, 1)), slab, scout)  # at the left slab
+    action = rng.uniform(-1, 1, (n, 3))
+    theirs = mujoco_step(arena, action)()
+    arena.step(action)
+    assert arena.contact.sum() > 4
+    np.testing.assert_allclose(arena.pose, theirs, atol=1e-6)

@@ -76,14 +76,11 @@ class Arena:
 
     def step(self, action: Float[np.ndarray, "n 3"], live: Bool[np.ndarray, " n"] | None = None):
         """Takes one control step of 0.1 s; actions are clipped to [-1, 1]. Scenes that are not `live` stand still."""
-        vx, vy, turn = np.clip(action, -1.0, 1.0).T
-        cos, sin = np.cos(self._qpos[:, 2]), np.sin(self._qpos[:, 2])
-        command = np.column_stack([V_MAX * (cos * vx - sin * vy), V_MAX * (sin * vx + cos * vy), W_MAX * turn])
         planar.advance(
             self._qpos,
             self._qvel,
             self._time,
-            command,
+            self.command(action),
             np.ones(self.n, bool) if live is None else live,
             self.slab,
             self.scout,
@@ -92,6 +89,12 @@ class Arena:
             PHYSICS_HZ // CONTROL_HZ,
         )
         self._observe()
+
+    def command(self, action: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """The world-frame velocities that an action asks for: m/s, m/s, rad/s."""
+        vx, vy, turn = np.clip(action, -1.0, 1.0).T
+        cos, sin = np.cos(self._qpos[:, 2]), np.sin(self._qpos[:, 2])
+        return np.column_stack([V_MAX * (cos * vx - sin * vy), V_MAX * (sin * vx + cos * vy), W_MAX * turn])
 
     def state(self) -> dict[str, np.ndarray]:
         """Every number that the next step depends on, to be given to `restore`, also in another process."""

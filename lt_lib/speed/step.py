@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 
+import mujoco
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
+from mujoco.batch import Batch
 
 from lt_lib.comm.messages import CONTENTS, Sender
-from lt_lib.envs.arena import Arena
+from lt_lib.envs.arena import CONTROL_HZ, PHYSICS_HZ, Arena, physics_xml
 from lt_lib.envs.camera import FastCamera
 from lt_lib.envs.layout import Layout
 from lt_lib.envs.reference import ReferenceCamera
@@ -20,7 +23,7 @@ ENVS = 64  # scenes stepped side by side, as in training
 
 
 def step_costs(layout: Layout, encoder: Result, executor: Result, rounds: int = 7) -> pd.DataFrame:
-    """Microseconds of processor time per scene and control step, by stage, with either camera.
+    """Microseconds of processor time per scene and control step, by stage: ours, and MuJoCo's camera and physics.
 
     Each number is the median over rounds in which all stages take turns. Processor time includes every thread, so these
     are costs on one core.
@@ -32,18 +35,39 @@ def step_costs(layout: Layout, encoder: Result, executor: Result, rounds: int = 
     latent = frozen.latent(frames)  # (64, 64)
     action = driver.mean_action(latent, route)  # (64, 3)
     stages = {
-        "fast camera": lambda: fast.frames(arena.pose, arena.slab, arena.scout[:, :2]),
-        "mujoco.Renderer": lambda: reference.pictures(arena.pose, arena.slab, arena.scout[:, :2]),
-        "physics": lambda: arena.step(action),
+        "our camera": lambda: fast.frames(arena.pose, arena.slab, arena.scout[:, :2]),
+        "MuJoCo's camera": lambda: reference.pictures(arena.pose, arena.slab, arena.scout[:, :2]),
+        "our physics": lambda: arena.step(action),
+        "MuJoCo's physics": mujoco_step(arena, action),
         "encoder": lambda: frozen.latent(frames),
         "policy": lambda: driver.mean_action(latent, route),
     }
     cost = {stage: seconds / ENVS * 1e6 for stage, seconds in taking_turns(stages, rounds).items()}
     reference.close()
-    shared = {stage: cost[stage] for stage in ("physics", "encoder", "policy")}
-    table = pd.DataFrame({name: {"camera": cost[name], **shared} for name in ("fast camera", "mujoco.Renderer")})
+    shared = {stage: cost[stage] for stage in ("encoder", "policy")}
+    whose = {"ours": "our", "MuJoCo": "MuJoCo's"}
+    table = pd.DataFrame(
+        {name: {part: cost[f"{by} {part}"] for part in ("camera", "physics")} | shared for name, by in whose.items()}
+    )
     table.loc["whole step"] = table.sum()
     return table
+
+
+def mujoco_step(arena: Arena, action: Float[np.ndarray, "n 3"]) -> Callable[[], Float[np.ndarray, "n 3"]]:
+    """A call that has MuJoCo's own batch take a control step, at first from an arena's poses; returns the new ones."""
+    model = mujoco.MjModel.from_xml_string(physics_xml(arena.layout))
+    batch = Batch(model, arena.n, nthread=1)
+    poses = batch.bind("qpos")
+    poses[:], batch.bind("ctrl")[:] = arena.pose, arena.command(action)
+    slabs = arena.layout.slabs[arena.slab]  # (n, slabs, 4)
+    batch.bind("mocap_pos")[:, :-1, :2] = (slabs[..., ::2] + slabs[..., 1::2]) / 2
+    batch.bind("mocap_pos")[:, -1, :2] = arena.scout[:, :2]
+
+    def step() -> Float[np.ndarray, "n 3"]:
+        batch.step(None, nstep=PHYSICS_HZ // CONTROL_HZ)
+        return poses
+
+    return step
 
 
 def control_step(
