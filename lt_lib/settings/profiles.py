@@ -201,8 +201,6 @@ SECTIONS: dict[str, Any] = {
     "scores": Annotated[list[Literal["sum", "mean"]], Field(min_length=1)],
     "budgets": Annotated[list[Budget], Field(min_length=1)],
     "resamples": Annotated[int, Field(ge=2)],
-    "singles": PositiveInt,
-    "timed_updates": Budget,
     "navigator": NavigatorConfig,
     "rollout": RolloutConfig,
     "pretraining": PretrainingConfig,
