@@ -7,6 +7,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from lt_lib.beyond import trials
 from lt_lib.beyond.corridors import ARENAS, corridor_layout
 from lt_lib.beyond.deciders import MESSAGES, train_deciders
 from lt_lib.beyond.decisions import DecisionProtocol, ceiling
@@ -24,12 +25,13 @@ from lt_lib.envs.occlusion import occlusion, require_occlusion
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.perception.frames import free_poses
 from lt_lib.perception.jepa import train_encoder
+from lt_lib.pixels.episodes import none_yet
 from lt_lib.pixels.executor import Executor, FrozenExecutor, train_executor
 from lt_lib.pixels.route import drawn, read_head, train_head
 from lt_lib.settings.base import LAYOUTS, UserError
 from lt_lib.settings.beyond import DeciderConfig
 from lt_lib.settings.perception import EncoderConfig
-from lt_lib.settings.pixels import ExecutorConfig, HeadConfig
+from lt_lib.settings.pixels import BankConfig, ExecutorConfig, HeadConfig
 from lt_lib.settings.profiles import SECTIONS, validated
 from lt_lib.store.runs import RunStore
 
@@ -277,12 +279,29 @@ def test_executors_are_those_weights_that_arrive_most_often_and_another_seed_is_
             return {f"{look}.share": s for look, s in zip(run.config.looks, shares[count, run.seed], strict=True)}
 
         def drive(self, run):
-            blocks = load_layout(run.config.layout).blocks
-            arrived = np.arange(10)[:, None, None] < 10 * run.inputs["executor"]["share"]
-            return {"success": ~blocks & arrived}
+            return {"arrived": np.arange(10) < 10 * run.inputs["executor"]["share"]}
 
     for each in protocol.protocols.values():
         object.__setattr__(each, "store", Store(tmp_path))
     found = protocol.executors({2: {"ours": {}}, 3: {"ours": {}}})
     assert {key: weights["share"] for key, weights in found.items()} == {2: 0.6, 3: 1.0}
     assert asked == [(2, 0), (3, 0), (2, 1), (2, 2)]
+
+
+def test_an_executor_is_tried_on_every_free_route_of_every_placement_from_draws_of_its_own(monkeypatch):
+    asked = {}
+
+    def drive(arena, camera, encoder, executor, draws, slab, route, commit_step, horizon, report):
+        asked.update(rows=arena.n, spawn=draws.spawn, slab=slab, route=route)
+        return none_yet(len(slab))._replace(success=slab == 0)
+
+    monkeypatch.setattr(trials, "drive", drive)
+    monkeypatch.setattr(trials, "FrozenEncoder", lambda *_: None)
+    monkeypatch.setattr(trials, "FrozenExecutor", lambda *_: None)
+    config = BankConfig(layout="corridors_4_two", entries=3)
+    arrived = trials.drive_free_routes(config, 7, report=quiet, encoder={}, executor={})["arrived"]
+    layout = load_layout("corridors_4_two")
+    assert arrived.shape == (3, 12) and asked["rows"] == 36  # six placements, two free routes each
+    assert (arrived == (np.repeat(np.arange(6), 2) == 0)).all()
+    assert not layout.blocks[asked["slab"], asked["route"]].any()
+    assert len({*zip(asked["slab"], asked["route"], map(tuple, asked["spawn"]), strict=True)}) == 36

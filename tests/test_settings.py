@@ -8,6 +8,7 @@ import pytest
 from lt_lib.gridworld.protocol import GridProtocol
 from lt_lib.hardware.protocol import HardwareProtocol
 from lt_lib.hardware.registration import read_gates
+from lt_lib.perception.gates import GateError
 from lt_lib.pixels.protocol import PixelProtocol
 from lt_lib.pixels.redraw import SCENES
 from lt_lib.settings.base import ROOT, Scene, Settings, UserError
@@ -44,6 +45,9 @@ class Recorder:
         return found
 
 
+PASSED = {"hazard": 1.0, "majority": 0.5, "walls": 1.0, "rank": 64.0}  # a gate report
+
+
 def with_store(protocol, store):
     object.__setattr__(protocol, "store", store)
     return protocol
@@ -51,7 +55,7 @@ def with_store(protocol, store):
 
 def pixel_runs(pixels: dict, seeds: dict, layout: str) -> tuple[PixelProtocol, Recorder]:
     """Every run that notebooks 02, 04 and 07 ask for."""
-    store = Recorder()
+    store = Recorder(**PASSED)
     protocol = with_store(PixelProtocol.of(pixels, layout, "cpu", 0), store)
     protocol.gate_reports(protocol.encoders())
     protocol.executor_weights({})
@@ -218,3 +222,26 @@ def test_every_setting_is_read_somewhere():
         f"{kind.__name__}.{name}" for kind in kinds for name in kind.model_fields if name in read
     }
     assert not unread
+
+
+@pytest.mark.parametrize(("walls", "tried"), [((0.96, 0.99), 1), ((0.94, 0.96), 2), ((0.9, 0.94, 0.94), 3)])
+def test_encoders_are_tried_seed_after_seed_until_one_passes_its_gates(walls, tried):
+    class Gated(Recorder):
+        def fetch(self, runs, what):
+            super().fetch(runs, what)
+            gate = [walls[run.inputs["encoder"]["seed"]] if run.inputs else None for run in runs]
+            return [
+                PASSED | {"walls": value} if value else {"seed": run.seed}
+                for run, value in zip(runs, gate, strict=True)
+            ]
+
+    study = {"gates": {"walls": 0.95}}
+    protocol = with_store(PixelProtocol.of(study, "default", "cpu", 0), Gated())
+    found = protocol.tried_encoders()
+    assert [encoder["seed"] for encoder, _ in found] == list(range(tried))
+    assert protocol.encoders()["ours"] == found[-1][0]
+    if max(walls) >= 0.95:
+        assert protocol.encoder_weights() == found[-1][0]
+    else:
+        with pytest.raises(GateError, match="wall-count R.2 0.940 is 0.010 short"):
+            protocol.encoder_weights()

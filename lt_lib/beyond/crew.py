@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from lt_lib.envs.layout import load_layout
-from lt_lib.pixels.episodes import arrival, roll_bank
+from lt_lib.beyond.trials import drive_free_routes
 from lt_lib.pixels.executor import train_executor
 from lt_lib.pixels.protocol import PixelProtocol
 from lt_lib.store.run import Result, Run
@@ -53,10 +52,10 @@ def _tried(
     kept = {(key, look): after(trained[key], look) for key in sizes for look in sizes[key].executor.looks}
     few = {key: each.bank.model_copy(update={"entries": TRIED}) for key, each in sizes.items()}
     drives = [
-        Run(roll_bank, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
+        Run(drive_free_routes, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
         for (key, _), weights in kept.items()
     ]
     tried: dict[Any, list[tuple[float, Result]]] = {key: [] for key in sizes}
-    for (key, _), weights, drive in zip(kept, kept.values(), store.fetch(drives, "trials"), strict=True):
-        tried[key].append((arrival(drive, load_layout(protocols[key].layout).blocks), weights))
+    for (key, _), weights, driven in zip(kept, kept.values(), store.fetch(drives, "trials"), strict=True):
+        tried[key].append((driven["arrived"].mean(), weights))
     return {key: max(each, key=lambda one: one[0]) for key, each in tried.items()}

@@ -127,6 +127,15 @@ def require_gates(found: Mapping[str, float], gates: Gates) -> None:
     )
 
 
+def passes(found: Mapping[str, float], gates: Gates) -> bool:
+    """Whether a checkpoint passes every preregistered gate."""
+    try:
+        require_gates(found, gates)
+    except GateError:
+        return False
+    return True
+
+
 def require(found: Mapping[str, float], limits: Mapping[str, tuple[str, float]]) -> None:
     """Raises GateError, naming every value that falls short of its limit; limits are {name: (words, least value)}."""
     failed = [

@@ -151,7 +151,7 @@ def roll_bank(
     shape = (config.entries, len(layout.placements), len(layout.routes))
     entry, slab, route = (axis.ravel() for axis in np.indices(shape))
     outcome = drive(
-        Arena(layout, config.envs),
+        Arena(layout, min(config.envs, len(entry))),
         FastCamera(layout),
         FrozenEncoder(encoder, device, config.precision),
         FrozenExecutor(executor, device),

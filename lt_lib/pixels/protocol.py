@@ -13,7 +13,7 @@ import numpy as np
 from lt_lib.comm.channel import CORRUPTIONS
 from lt_lib.comm.messages import CONDITIONS
 from lt_lib.envs.layout import load_layout
-from lt_lib.perception.gates import Measured, measure_gates, require_gates
+from lt_lib.perception.gates import Measured, measure_gates, passes, require_gates
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import facts_of, load_frozen, save_frozen
 from lt_lib.pixels.episodes import roll_bank
@@ -30,6 +30,7 @@ from lt_lib.store.runs import RunStore, fetch_by_name
 from lt_lib.store.states import only
 
 SEED = 0  # of the one encoder and the one executor, as in the paper; heads have seeds of their own
+TRIES = 3  # encoders at most, a seed each, where the gates fail
 
 
 @dataclass(frozen=True)
@@ -64,24 +65,33 @@ class PixelProtocol:
         }
         if self.weights:
             del configs["ours"]
-        trained = self.store.fetch([Run(train_encoder, config, SEED) for config in configs.values()], "encoders")
-        kept = {"ours": self._kept("encoder")} if self.weights else {}
-        return kept | dict(zip(configs, trained, strict=True))
+        runs = [Run(train_encoder, config, SEED) for config in configs.values()]
+        trained = dict(zip(configs, self.store.fetch(runs, "encoders"), strict=True))
+        return {"ours": self.tried_encoders()[-1][0]} | {name: trained[name] for name in trained if name != "ours"}
 
     def gate_reports(self, encoders: Mapping[str, Result]) -> dict[str, Result]:
         """Probes and rank of checkpoints; see `perception.gates.Measured`."""
         runs = [Run(measure_gates, self.sizes.probe, SEED, {"encoder": encoder}) for encoder in encoders.values()]
         return dict(zip(encoders, self.store.fetch(runs, "freeze gates"), strict=True))
 
+    def tried_encoders(self) -> list[tuple[Result, Result]]:
+        """Checkpoints and their gate reports, seed after seed, up to the first that passes; at most `TRIES` of them."""
+        tried = []
+        for seed in range(SEED, SEED + TRIES):
+            trained = self._kept("encoder") if self.weights else self._trained_encoder(seed)
+            tried.append((trained, self.gate_reports({"ours": trained})["ours"]))
+            if self.weights or passes(tried[-1][1], self.sizes.gates):
+                break
+        return tried
+
     def encoder_weights(self) -> Result:
-        """Stage 1: E and P after passing the gates. Raises GateError if they fail."""
-        trained = (
-            self._kept("encoder")
-            if self.weights
-            else self.store.fetch([Run(train_encoder, self.sizes.encoder, SEED)], "encoder")[0]
-        )
-        require_gates(self.gate_reports({"ours": trained})["ours"], self.sizes.gates)
+        """Stage 1: E and P after passing the gates. Raises GateError if none of the tried ones does."""
+        trained, report = self.tried_encoders()[-1]
+        require_gates(report, self.sizes.gates)
         return trained
+
+    def _trained_encoder(self, seed: int) -> Result:
+        return self.store.fetch([Run(train_encoder, self.sizes.encoder, seed)], "encoder")[0]
 
     def _kept(self, kind: str) -> Result:
         return load_frozen(self.weights, kind, load_layout(self.layout))
