@@ -13,6 +13,7 @@ class MatchedEncoderConfig(PictureConfig):
 
     layout: str = "matched"
     frames: PositiveInt = 102_400
+    covariance: NonNegativeFloat = 2.5  # with which its gates were fixed
     colour: Share = 1.0
 
 

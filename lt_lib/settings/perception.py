@@ -18,7 +18,7 @@ class ObjectiveConfig(Scene):
     ema: Annotated[float, Field(ge=0, lt=1)] = 0.99
     prediction: NonNegativeFloat = 1.0
     variance: NonNegativeFloat = 25.0
-    covariance: NonNegativeFloat = 2.5
+    covariance: NonNegativeFloat = 1.0
     reconstruction: NonNegativeFloat = 1.0
 
 
