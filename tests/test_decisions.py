@@ -7,7 +7,6 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from lt_lib.beyond import trials
 from lt_lib.beyond.corridors import ARENAS, corridor_layout
 from lt_lib.beyond.deciders import MESSAGES, train_deciders
 from lt_lib.beyond.decisions import DecisionProtocol, ceiling
@@ -25,6 +24,8 @@ from lt_lib.envs.occlusion import occlusion, require_occlusion
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.perception.frames import free_poses
 from lt_lib.perception.jepa import train_encoder
+from lt_lib.pixels import trials
+from lt_lib.pixels.crew import with_looks
 from lt_lib.pixels.episodes import none_yet
 from lt_lib.pixels.executor import Executor, FrozenExecutor, train_executor
 from lt_lib.pixels.route import drawn, read_head, train_head
@@ -263,7 +264,7 @@ def test_every_message_has_a_width_that_fits(scenes):
 
 def test_executors_are_those_weights_that_arrive_most_often_and_another_seed_is_trained_where_few_do(tmp_path):
     protocol = DecisionProtocol.of({2: "corridors_2", 3: "corridors_3"}, {"executor": {"steps": 65_536}}, "cpu", 1)
-    sizes = protocol.protocols[3].sizes.executor
+    sizes = with_looks(protocol.protocols[3].sizes.executor)
     assert sizes.looks == (49_152, 57_344, 73_728, 81_920, 98_304) and sizes.steps == 98_304  # whole updates, half on
     shares = {(2, 0): (0.0, 0.5, 0.2, 0.1, 0.1), (2, 1): (0.0, 0.0, 0.3, 0.3, 0.3), (2, 2): (0.0, 0.4, 0.4, 0.6, 0.0)}
     shares[3, 0] = (0.2, 1.0, 1.0, 0.9, 0.0)

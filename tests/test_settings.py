@@ -17,6 +17,7 @@ from lt_lib.settings.hardware import MatchedEncoderConfig, SessionsConfig
 from lt_lib.settings.pixels import PixelsConfig
 from lt_lib.settings.profiles import load_profile, notebook_names, validated
 from lt_lib.settings.velocity import NavigatorConfig, RolloutConfig
+from lt_lib.store.runs import RunStore
 from lt_lib.velocity.transfer import DirectTransfer
 from run_all import code_cells
 
@@ -29,14 +30,15 @@ PLAYED = {
 OTHER = {"layout": "wide", "latency": 3}  # neither is a default
 
 
-class Recorder:
+class Recorder(RunStore):
     """A run store that computes nothing and remembers what it was asked for."""
 
     def __init__(self, **result):
-        self.runs, self.result = [], result
+        super().__init__(ROOT)
+        self.__dict__.update(runs=[], result=result)  # a store is frozen
 
     def fetch(self, runs, what):
-        self.runs += runs
+        self.runs.extend(runs)
         return [dict(self.result) for _ in runs]
 
     def configs(self, function: str) -> list[Settings]:
@@ -45,7 +47,7 @@ class Recorder:
         return found
 
 
-PASSED = {"hazard": 1.0, "majority": 0.5, "walls": 1.0, "rank": 64.0}  # a gate report
+PASSED = {"hazard": 1.0, "majority": 0.5, "walls": 1.0, "rank": 64.0, "arrived": np.ones(1)}  # gates, and a trial
 
 
 def with_store(protocol, store):

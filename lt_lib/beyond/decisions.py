@@ -1,16 +1,16 @@
 """Decisions among C corridors: the paper's protocol in arenas of `beyond.corridors`, side by side."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 
-from lt_lib.beyond.crew import arriving_executors, with_looks
 from lt_lib.envs.layout import load_layout
 from lt_lib.perception.jepa import train_encoder
+from lt_lib.pixels.crew import arriving_executors
 from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -53,9 +53,10 @@ class DecisionProtocol:
         return found
 
     def executors(self, encoders: Mapping[Any, Mapping[str, Result]]) -> dict[Any, Result]:
-        """The low-level controllers, each with a command per corridor; see `beyond.crew`."""
+        """The low-level controllers, each with a command per corridor; see `pixels.crew`."""
         eyes = {key: encoders[key]["ours"] for key in self.protocols}
-        return arriving_executors(self.store, self.protocols, eyes)
+        sizes = {key: protocol.sizes for key, protocol in self.protocols.items()}
+        return arriving_executors(self.store, sizes, eyes)
 
     def banks(self, encoders: Mapping[Any, Mapping[str, Result]], executors: Mapping[Any, Result]) -> dict[Any, Result]:
         """Every outcome of some draws of each arena: arrays (entries, placement, route)."""
@@ -92,4 +93,6 @@ def ceiling(blocks: Bool[np.ndarray, "placements routes"], bits: int) -> float:
 
 def _grown(pixel_study: Mapping[str, Any], name: str, device: str, workers: int | str) -> PixelProtocol:
     protocol = PixelProtocol.of(pixel_study, name, device, workers)
-    return with_looks(protocol, protocol.sizes.executor.steps * len(load_layout(name).routes) // 2)
+    executor = protocol.sizes.executor
+    longer = executor.model_copy(update={"steps": executor.steps * len(load_layout(name).routes) // 2})
+    return replace(protocol, sizes=protocol.sizes.model_copy(update={"executor": longer}))

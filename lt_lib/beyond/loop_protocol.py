@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from lt_lib.beyond.crew import arriving_executors, with_looks
 from lt_lib.beyond.loop import drive_behind, look, loop_draws, loop_heads, loop_wires, train_loop_heads
 from lt_lib.beyond.senders import frozen
 from lt_lib.envs.layout import load_layout
 from lt_lib.hardware.matched import train_matched_encoder
 from lt_lib.hardware.registration import read_gates
+from lt_lib.pixels.crew import arriving_executors
 from lt_lib.pixels.episodes import Draws
 from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.settings.base import everywhere, require_known
@@ -70,9 +70,8 @@ class LoopProtocol:
         return dict(zip(configs, self.store.fetch(runs, "matched encoders"), strict=True))
 
     def executors(self, encoders: Mapping[str, Result]) -> dict[str, Result]:
-        """A controller behind each encoder, pretrained in plain simulation; see `beyond.crew`."""
-        protocol = with_looks(self.pixels, self.pixels.sizes.executor.steps)
-        return arriving_executors(self.store, dict.fromkeys(encoders, protocol), encoders)
+        """A controller behind each encoder, pretrained in plain simulation; see `pixels.crew`."""
+        return arriving_executors(self.store, dict.fromkeys(encoders, self.pixels.sizes), encoders)
 
     def readers(self, encoders: Mapping[str, Result], executors: Mapping[str, Result]) -> dict[tuple[str, str], Result]:
         """Heads by encoder and by the looks of the simulated frames that they learned from."""

@@ -20,6 +20,7 @@ from lt_lib.gridworld.protocol import GridProtocol
 from lt_lib.perception.gates import Measured
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import save_frozen
+from lt_lib.pixels.crew import with_looks
 from lt_lib.pixels.executor import train_executor
 from lt_lib.pixels.protocol import SEED, PixelProtocol
 from lt_lib.settings.base import everywhere, require_known
@@ -73,7 +74,7 @@ class ControlProtocol:
 
     def train_beside_executor(self, encoder: Result) -> None:
         """Trains the executor, which takes one core for minutes, and beside it what else needs no bank."""
-        driver = Run(train_executor, self.pixels.sizes.executor, SEED, {"encoder": encoder})
+        driver = Run(train_executor, with_looks(self.pixels.sizes.executor), SEED, {"encoder": encoder})
         others = [*self._layout_encoders().values(), *self._patch_senders().values()]
         self.store.fetch(others if self.pixels.weights else [driver, *others], "executor, and encoders of other scenes")
 

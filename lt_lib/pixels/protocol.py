@@ -16,8 +16,8 @@ from lt_lib.envs.layout import load_layout
 from lt_lib.perception.gates import Measured, measure_gates, passes, require_gates
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.perception.weights import facts_of, load_frozen, save_frozen
+from lt_lib.pixels.crew import arriving_executors
 from lt_lib.pixels.episodes import roll_bank
-from lt_lib.pixels.executor import train_executor
 from lt_lib.pixels.redraw import REDRAWS, SCENES, train_redrawn_head
 from lt_lib.pixels.route import evaluate_head, train_head
 from lt_lib.settings.base import ROOT, everywhere, require_known
@@ -97,10 +97,10 @@ class PixelProtocol:
         return load_frozen(self.weights, kind, load_layout(self.layout))
 
     def executor_weights(self, encoder: Result) -> Result:
-        """The low-level controller, pretrained behind the frozen encoder."""
+        """The low-level controller, pretrained behind the frozen encoder; see `pixels.crew`."""
         if self.weights:
             return self._kept("executor")
-        return self.store.fetch([Run(train_executor, self.sizes.executor, SEED, {"encoder": encoder})], "executor")[0]
+        return arriving_executors(self.store, {self.layout: self.sizes}, {self.layout: encoder})[self.layout]
 
     def encoder_facts(self, report: Result) -> dict:
         """What is stored with the frozen encoder: its training settings and its gate measurements."""
