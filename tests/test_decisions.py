@@ -25,14 +25,14 @@ from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.perception.frames import free_poses
 from lt_lib.perception.jepa import train_encoder
 from lt_lib.pixels import trials
-from lt_lib.pixels.crew import with_looks
+from lt_lib.pixels.crew import arriving_executors, with_looks
 from lt_lib.pixels.episodes import none_yet
 from lt_lib.pixels.executor import Executor, FrozenExecutor, train_executor
 from lt_lib.pixels.route import drawn, read_head, train_head
 from lt_lib.settings.base import LAYOUTS, UserError
 from lt_lib.settings.beyond import DeciderConfig
 from lt_lib.settings.perception import EncoderConfig
-from lt_lib.settings.pixels import BankConfig, ExecutorConfig, HeadConfig
+from lt_lib.settings.pixels import BankConfig, ExecutorConfig, HeadConfig, PixelsConfig
 from lt_lib.settings.profiles import SECTIONS, validated
 from lt_lib.store.runs import RunStore
 
@@ -280,7 +280,7 @@ def test_executors_are_those_weights_that_arrive_most_often_and_another_seed_is_
             return {f"{look}.share": s for look, s in zip(run.config.looks, shares[count, run.seed], strict=True)}
 
         def drive(self, run):
-            return {"arrived": np.arange(10) < 10 * run.inputs["executor"]["share"]}
+            return {"arrives": np.arange(10) < 10 * run.inputs["executor"]["share"], "touches": np.ones(1)}
 
     for each in protocol.protocols.values():
         object.__setattr__(each, "store", Store(tmp_path))
@@ -289,20 +289,32 @@ def test_executors_are_those_weights_that_arrive_most_often_and_another_seed_is_
     assert asked == [(2, 0), (3, 0), (2, 1), (2, 2)]
 
 
-def test_an_executor_is_tried_on_every_free_route_of_every_placement_from_draws_of_its_own(monkeypatch):
-    asked = {}
+def test_an_executor_is_tried_as_its_pretraining_rewards_it_on_every_route_of_every_placement(monkeypatch):
+    layout = load_layout("corridors_4_two")  # six placements, two free routes each
 
     def drive(arena, camera, encoder, executor, draws, slab, route, commit_step, horizon, report):
-        asked.update(rows=arena.n, spawn=draws.spawn, slab=slab, route=route)
-        return none_yet(len(slab))._replace(success=slab == 0)
+        assert arena.n == 3 * 6 * 4 and len({*zip(slab, route, map(tuple, draws.spawn), strict=True)}) == arena.n
+        there = none_yet(len(slab))._replace(success=(slab == 0) & ~layout.blocks[slab, route], contacts=route + 0)
+        return there._replace(entered=np.where(slab == 5, route, NO_CORRIDOR))
 
     monkeypatch.setattr(trials, "drive", drive)
     monkeypatch.setattr(trials, "FrozenEncoder", lambda *_: None)
     monkeypatch.setattr(trials, "FrozenExecutor", lambda *_: None)
-    config = BankConfig(layout="corridors_4_two", entries=3)
-    arrived = trials.drive_free_routes(config, 7, report=quiet, encoder={}, executor={})["arrived"]
-    layout = load_layout("corridors_4_two")
-    assert arrived.shape == (3, 12) and asked["rows"] == 36  # six placements, two free routes each
-    assert (arrived == (np.repeat(np.arange(6), 2) == 0)).all()
-    assert not layout.blocks[asked["slab"], asked["route"]].any()
-    assert len({*zip(asked["slab"], asked["route"], map(tuple, asked["spawn"]), strict=True)}) == 36
+    found = trials.try_executor(
+        BankConfig(layout="corridors_4_two", entries=3), 7, report=quiet, encoder={}, executor={}
+    )
+    slab, route = np.nonzero(~layout.blocks)
+    assert (found["arrives"] == (slab == 0)).all() and found["arrives"].shape == (3, 12)
+    slab, route = np.nonzero(layout.blocks)
+    assert (found["touches"] == ((slab == 5) & (route > 0))).all() and found["touches"].any()
+
+
+def test_weights_that_never_reach_a_blocked_corridor_s_slab_are_not_taken(tmp_path):
+    class Store(RunStore):
+        def fetch(self, runs, what):
+            if what == "executors":
+                return [{f"{look}.w": np.full(1, run.seed) for look in run.config.looks} for run in runs]
+            return [{"arrives": np.ones(4), "touches": np.full(4, run.inputs["executor"]["w"][0] == 2)} for run in runs]
+
+    sizes = PixelsConfig(executor=ExecutorConfig(steps=16_384))
+    assert arriving_executors(Store(tmp_path), {"": sizes}, {"": {}})[""]["w"] == 2

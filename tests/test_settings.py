@@ -47,7 +47,14 @@ class Recorder(RunStore):
         return found
 
 
-PASSED = {"hazard": 1.0, "majority": 0.5, "walls": 1.0, "rank": 64.0, "arrived": np.ones(1)}  # gates, and a trial
+PASSED = {
+    "hazard": 1.0,
+    "majority": 0.5,
+    "walls": 1.0,
+    "rank": 64.0,
+    "arrives": np.ones(1),
+    "touches": np.ones(1),
+}  # gates, and a trial
 
 
 def with_store(protocol, store):

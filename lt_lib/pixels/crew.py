@@ -1,8 +1,9 @@
-"""Controllers that arrive: of a few trainings, the weights whose mean command reaches the goal most often.
+"""Controllers that do as told: of a few trainings, the weights whose mean command most often gets where it is sent.
 
-A controller that explores may reach the goal long before its mean does, and the mean may lose the way again, in one
-corridor and not in the other. So weights are kept along the second half of a training, each drives a few draws that no
-bank has, and where even the best seldom arrive, another seed is trained. No message plays a part in this.
+A controller that explores may reach the goal, or the slab of a blocked corridor, long before its mean does, and the
+mean may lose the way again, in one corridor and not in the other. So weights are kept along the second half of a
+training, each drives a few draws that no bank has, and where even the best seldom get there, another seed is trained.
+No message plays a part in this.
 """
 
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lt_lib.pixels.executor import train_executor
-from lt_lib.pixels.trials import drive_free_routes
+from lt_lib.pixels.trials import try_executor
 from lt_lib.settings.pixels import ExecutorConfig, PixelsConfig
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -19,7 +20,7 @@ from lt_lib.store.states import after, only
 
 PARTS = 4  # that the second half of a training is divided into, the weights kept at each end
 TRIED, TRIAL = 4, 1_000  # draws that each of them drives, and the seed of those draws, no shard of a bank
-SEEDS, ENOUGH = 3, 0.95  # trainings at most, and the share of arrivals that ends the search
+SEEDS, ENOUGH = 3, 0.95  # trainings at most; shares of arrivals, and of slabs reached, that end the search
 
 
 def with_looks(executor: ExecutorConfig) -> ExecutorConfig:
@@ -44,18 +45,18 @@ def arriving_executors(
 def _tried(
     store: RunStore, sizes: Mapping[Any, PixelsConfig], encoders: Mapping[Any, Result], seed: int
 ) -> dict[Any, tuple[float, Result]]:
-    """Of one training each, how often its best weights arrive, and the weights."""
+    """Of one training each, how often its best weights get there, free or blocked, and the weights."""
     training = {key: with_looks(each.executor) for key, each in sizes.items()}
     runs = [Run(train_executor, training[key], seed, {"encoder": encoders[key]}) for key in sizes]
     trained = dict(zip(sizes, store.fetch(runs, "executors"), strict=True))
     kept = {(key, look): after(trained[key], look) for key in sizes for look in training[key].looks}
     few = {key: each.bank.model_copy(update={"entries": TRIED}) for key, each in sizes.items()}
     drives = [
-        Run(drive_free_routes, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
+        Run(try_executor, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
         for (key, _), weights in kept.items()
     ]
     tried: dict[Any, list[tuple[float, Result]]] = {key: [] for key in sizes}
     for ((key, look), weights), driven in zip(kept.items(), store.fetch(drives, "trials"), strict=True):
         whole = weights | only(trained[key], "curve") | {"taken": np.array(look)}
-        tried[key].append((driven["arrived"].mean(), whole))
+        tried[key].append((min(driven["arrives"].mean(), driven["touches"].mean()), whole))
     return {key: max(each, key=lambda one: one[0]) for key, each in tried.items()}

@@ -1,4 +1,4 @@
-"""A trial of an executor: some draws on the free routes alone, where it should arrive."""
+"""A trial of an executor: a few draws under every placement and route, as its pretraining rewards it (obedience)."""
 
 from collections.abc import Callable, Mapping
 
@@ -14,7 +14,7 @@ from lt_lib.settings.pixels import BankConfig
 from lt_lib.settings.streams import Stream
 
 
-def drive_free_routes(
+def try_executor(
     config: BankConfig,
     seed: int,
     *,
@@ -22,12 +22,15 @@ def drive_free_routes(
     encoder: Mapping[str, np.ndarray],
     executor: Mapping[str, np.ndarray],
 ) -> dict:
-    """Whether the mean command arrives: "arrived" (entries, free) on every free route under every placement."""
+    """Whether the mean command does as told, (entries, pairs of a placement and a route each).
+
+    "arrives"  on free routes: it reaches the goal
+    "touches"  on blocked ones: it enters the corridor and reaches a slab
+    """
     layout, device = load_layout(config.layout), config.device
     draws = draw_scenes(layout, config.entries, Stream.BANK.generator(seed))
-    slab, route = np.nonzero(~layout.blocks)
-    entry = np.repeat(np.arange(config.entries), len(slab))
-    slab, route = (np.tile(each, config.entries) for each in (slab, route))
+    shape = (config.entries, len(layout.placements), len(layout.routes))
+    entry, slab, route = (axis.ravel() for axis in np.indices(shape))
     outcome = drive(
         Arena(layout, min(config.envs, len(entry))),
         FastCamera(layout),
@@ -40,4 +43,6 @@ def drive_free_routes(
         HORIZON,
         report,
     )
-    return {"arrived": outcome.success.reshape(config.entries, -1)}
+    arrives = outcome.success.reshape(shape)
+    touches = ((outcome.entered == route) & (outcome.contacts > 0)).reshape(shape)
+    return {"arrives": arrives[:, ~layout.blocks], "touches": touches[:, layout.blocks]}
