@@ -24,7 +24,7 @@ from lt_lib.envs.occlusion import occlusion, require_occlusion
 from lt_lib.envs.reference import ReferenceCamera
 from lt_lib.perception.frames import free_poses
 from lt_lib.perception.jepa import train_encoder
-from lt_lib.pixels import trials
+from lt_lib.pixels import episodes
 from lt_lib.pixels.crew import arriving_executors, with_looks
 from lt_lib.pixels.episodes import none_yet
 from lt_lib.pixels.executor import Executor, FrozenExecutor, train_executor
@@ -262,6 +262,12 @@ def test_every_message_has_a_width_that_fits(scenes):
     assert all(MESSAGES[name](few, Sixty()).shape[1] <= 64 for name in MESSAGES)
 
 
+def at_every_slab(blocks):
+    """A bank of one draw in which every blocked corridor is entered and its slab touched."""
+    entered = np.broadcast_to(np.arange(blocks.shape[1]), (1, *blocks.shape))
+    return {"success": ~blocks[None], "entered": entered, "contacts": blocks[None].astype(int)}
+
+
 def test_executors_are_those_weights_that_arrive_most_often_and_another_seed_is_trained_where_few_do(tmp_path):
     protocol = DecisionProtocol.of({2: "corridors_2", 3: "corridors_3"}, {"executor": {"steps": 65_536}}, "cpu", 1)
     sizes = with_looks(protocol.protocols[3].sizes.executor)
@@ -280,7 +286,9 @@ def test_executors_are_those_weights_that_arrive_most_often_and_another_seed_is_
             return {f"{look}.share": s for look, s in zip(run.config.looks, shares[count, run.seed], strict=True)}
 
         def drive(self, run):
-            return {"arrives": np.arange(10) < 10 * run.inputs["executor"]["share"], "touches": np.ones(1)}
+            blocks = load_layout(run.config.layout).blocks
+            arrived = np.arange(10)[:, None, None] < 10 * run.inputs["executor"]["share"]
+            return at_every_slab(blocks) | {"success": ~blocks & arrived}
 
     for each in protocol.protocols.values():
         object.__setattr__(each, "store", Store(tmp_path))
@@ -297,16 +305,17 @@ def test_an_executor_is_tried_as_its_pretraining_rewards_it_on_every_route_of_ev
         there = none_yet(len(slab))._replace(success=(slab == 0) & ~layout.blocks[slab, route], contacts=route + 0)
         return there._replace(entered=np.where(slab == 5, route, NO_CORRIDOR))
 
-    monkeypatch.setattr(trials, "drive", drive)
-    monkeypatch.setattr(trials, "FrozenEncoder", lambda *_: None)
-    monkeypatch.setattr(trials, "FrozenExecutor", lambda *_: None)
-    found = trials.try_executor(
-        BankConfig(layout="corridors_4_two", entries=3), 7, report=quiet, encoder={}, executor={}
-    )
+    monkeypatch.setattr(episodes, "drive", drive)
+    monkeypatch.setattr(episodes, "FrozenEncoder", lambda *_: None)
+    monkeypatch.setattr(episodes, "FrozenExecutor", lambda *_: None)
+    config = BankConfig(layout="corridors_4_two", entries=3)
+    found = episodes.roll_bank(config, 7, report=quiet, encoder={}, executor={})
     slab, route = np.nonzero(~layout.blocks)
-    assert (found["arrives"] == (slab == 0)).all() and found["arrives"].shape == (3, 12)
+    free = found["success"][:, ~layout.blocks]
+    assert (free == (slab == 0)).all() and free.shape == (3, 12)
+    assert episodes.arrival(found, layout.blocks) == (slab == 0).mean()
     slab, route = np.nonzero(layout.blocks)
-    assert (found["touches"] == ((slab == 5) & (route > 0))).all() and found["touches"].any()
+    assert episodes.slab_reached(found, layout.blocks) == ((slab == 5) & (route > 0)).mean() > 0
 
 
 def test_weights_that_never_reach_a_blocked_corridor_s_slab_are_not_taken(tmp_path):
@@ -314,7 +323,9 @@ def test_weights_that_never_reach_a_blocked_corridor_s_slab_are_not_taken(tmp_pa
         def fetch(self, runs, what):
             if what == "executors":
                 return [{f"{look}.w": np.full(1, run.seed) for look in run.config.looks} for run in runs]
-            return [{"arrives": np.ones(4), "touches": np.full(4, run.inputs["executor"]["w"][0] == 2)} for run in runs]
+            everywhere = at_every_slab(load_layout("default").blocks)
+            never = everywhere | {"contacts": np.zeros((1, 2, 2))}
+            return [everywhere if run.inputs["executor"]["w"][0] == 2 else never for run in runs]
 
     sizes = PixelsConfig(executor=ExecutorConfig(steps=16_384))
     assert arriving_executors(Store(tmp_path), {"": sizes}, {"": {}})[""]["w"] == 2

@@ -22,15 +22,11 @@ def compiled_model(layout, changes=()):
     return model
 
 
-def centres(layout):
-    return (layout.slabs[..., ::2] + layout.slabs[..., 1::2]) / 2
-
-
 def around_things(layout, model, n, seed=0):
     """States (pose, speed, command, slab, scout) beside boxes, at their corners and seams, and beside the scout."""
     rng = np.random.default_rng(seed)
     slab, scout, radius = rng.integers(0, len(layout.placements), n), layout.scout.sample(n, rng), layout.robot.radius
-    boxes = planar.boxes(model, centres(layout))
+    boxes = planar.boxes(model, layout.slab_centres)
     centre, half = boxes[slab, rng.integers(0, boxes.shape[1], n)].transpose(1, 0, 2)[..., :2]
     across, side = rng.uniform(-1, 1, (n, 2)), rng.choice([-1, 1], (n, 2))
     place = side * (half + radius - rng.uniform(-0.003, 0.012, (n, 2)))  # at a corner
@@ -48,7 +44,7 @@ def around_things(layout, model, n, seed=0):
 def ours(layout, model, state, steps):
     """Pose and speed after physics steps."""
     pose, speed, command, slab, scout = (values.copy() for values in state)
-    boxes, live = planar.boxes(model, centres(layout)), np.ones(len(pose), bool)
+    boxes, live = planar.boxes(model, layout.slab_centres), np.ones(len(pose), bool)
     planar.advance(pose, speed, np.zeros(len(pose)), command, live, slab, scout, boxes, planar.mechanics(model), steps)
     return pose, speed
 
@@ -59,7 +55,7 @@ def started(layout, model, state):
     batch = Batch(model, len(pose), nthread=1)
     for name, values in (("qpos", pose), ("qvel", speed), ("ctrl", command)):
         batch.bind(name)[:] = values
-    batch.bind("mocap_pos")[:, :-1, :2], batch.bind("mocap_pos")[:, -1, :2] = centres(layout)[slab], scout[:, :2]
+    batch.bind("mocap_pos")[:, :-1, :2], batch.bind("mocap_pos")[:, -1, :2] = layout.slab_centres[slab], scout[:, :2]
     return batch
 
 
@@ -68,7 +64,7 @@ def forwarded(layout, model, state):
     for pose, speed, command, slab, scout in zip(*state, strict=True):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:], data.ctrl[:] = pose, speed, command
-        data.mocap_pos[:-1, :2], data.mocap_pos[-1, :2] = centres(layout)[slab], scout[:2]
+        data.mocap_pos[:-1, :2], data.mocap_pos[-1, :2] = layout.slab_centres[slab], scout[:2]
         mujoco.mj_forward(model, data)
         yield data
 

@@ -44,7 +44,7 @@ class Arena:
         model = mujoco.MjModel.from_xml_string(physics_xml(layout))
         self.timestep = model.opt.timestep  # seconds of simulated time per physics step
         self._mechanics = planar.mechanics(model)
-        self._boxes = planar.boxes(model, (layout.slabs[..., ::2] + layout.slabs[..., 1::2]) / 2)
+        self._boxes = planar.boxes(model, layout.slab_centres)
         self._qpos, self._qvel, self._time = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
         self.slab = np.zeros(n, np.int64)
         self.scout = np.tile(layout.scout.array, (n, 1))

@@ -182,6 +182,11 @@ class Layout(Settings):
         return np.array(each)
 
     @cached_property
+    def slab_centres(self) -> Float[np.ndarray, "placements slabs 2"]:
+        """Where the slabs' middles are (x, y), as `slabs`."""
+        return (self.slabs[..., ::2] + self.slabs[..., 1::2]) / 2
+
+    @cached_property
     def blocks(self) -> Bool[np.ndarray, "placements corridors"]:
         """Whether each placement blocks each corridor."""
         return np.array([[i in blocked for i in range(len(self.routes))] for blocked in self.placements])

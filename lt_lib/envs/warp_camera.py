@@ -58,8 +58,7 @@ class WarpCamera:
         turn[:, self._mocap["navigator"]] = 0
         turn[:, self._mocap["navigator"], 0] = np.cos(eyes[:, 2] / 2)
         turn[:, self._mocap["navigator"], 3] = np.sin(eyes[:, 2] / 2)
-        boxes = self._layout.slabs[slabs]  # (B, slabs, 4)
-        for i, centre in enumerate(np.moveaxis((boxes[..., ::2] + boxes[..., 1::2]) / 2, 1, 0)):
+        for i, centre in enumerate(np.moveaxis(self._layout.slab_centres[slabs], 1, 0)):
             position[:, self._mocap[f"slab {i}"], :2] = centre
         position[:, self._mocap["scout"], :2] = others
         with wp.ScopedDevice(self._device):

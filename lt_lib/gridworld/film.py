@@ -1,6 +1,5 @@
 """GIF of one gridworld episode: the map, both fields of view, and what the message changes."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -28,18 +27,18 @@ ARROWS = ("stay", "right", "left", "up", "down")  # on the map
 def film(grid: Grid, policy: Result, encoder: Result, content: str, start: int, slab: int, path: Path) -> Path:
     """Films a greedy episode from a spawn cell with the slab in one corridor; one picture per step."""
     inputs, actor = Inputs.of(grid, cells(grid, encoder), content), read_actor(policy)
-    cell, pictures, told = start, [], []
+    cell, pictures, held = start, [], []
     for step in range(LONGEST):
         message = 0 if step == 0 else 1 + len(grid.posts) // 2
-        pictures.append(_picture(grid, inputs, actor, np.array([message, cell, slab]), step))
+        row = torch.tensor([[message, cell, slab]])
+        told, untold = (_decide(inputs, actor, row, loudness) for loudness in (1.0, 0.0))
+        decides = told.argmax() != untold.argmax()  # without the message's content another action would be likeliest
+        pictures.append(_picture(grid, cell, slab, step, told, untold, decides))
+        held.append(2 * STEP_MS if decides else STEP_MS)
         if grid.goal[cell] or grid.slab[slab, cell]:
             break
-        told.append(_message_decides(inputs, actor, torch.tensor([[message, cell, slab]])))
-        probs = _decide(inputs, actor, torch.tensor([[message, cell, slab]]), 1.0)
-        cell = int(grid.following[cell, probs.argmax()])
+        cell = int(grid.following[cell, told.argmax()])
     path.parent.mkdir(parents=True, exist_ok=True)
-    held = [2 * STEP_MS if decides else STEP_MS for decides in told]
-    held += [STEP_MS] * (len(pictures) - len(held))
     iio.imwrite(path, pictures, duration=[*held[:-1], 3 * STEP_MS], loop=0)
     return path
 
@@ -53,15 +52,9 @@ def _decide(inputs: Inputs, actor: Actor, row, loudness: float) -> Float[np.ndar
     return actor(inputs.own[cell, slab], wires, present).softmax(1)[0].numpy()
 
 
-def _message_decides(inputs: Inputs, actor: Actor, row) -> bool:
-    """Whether the likeliest action is another one without the message's content."""
-    return bool(_decide(inputs, actor, row, 1.0).argmax() != _decide(inputs, actor, row, 0.0).argmax())
-
-
-def _picture(grid: Grid, inputs: Inputs, actor: Actor, state: Sequence[int], step: int) -> UInt8[np.ndarray, "h w 3"]:
+def _picture(grid: Grid, cell: int, slab: int, step: int, told, untold, decides) -> UInt8[np.ndarray, "h w 3"]:
     figure = Figure(figsize=(10, 3.3), dpi=80, layout="constrained")
     above, sees, sends, acts = figure.subplots(1, 4, width_ratios=(1.7, 1, 1, 1.1))
-    message, cell, slab = (int(x) for x in state)
     post = grid.posts[len(grid.posts) // 2]
     board(above, grid, slab)
     above.plot(*grid.centres[cell], "o", color=NAVIGATOR, ms=10, mec="white")
@@ -69,16 +62,13 @@ def _picture(grid: Grid, inputs: Inputs, actor: Actor, state: Sequence[int], ste
     above.set_title(f"step {step}: slab {SIDES[slab]}", fontsize=12)
     patch(sees, grid.patches[cell, slab], NAVIGATOR, "navigator sees")
     patch(sends, grid.patches[post, slab], SCOUT, "scout sees, and sends")
-    row = torch.tensor([[message, cell, slab]])
-    with_message, without = (_decide(inputs, actor, row, loudness) for loudness in (1.0, 0.0))
     places = np.arange(len(ARROWS))
-    acts.barh(places + 0.2, with_message, 0.38, color=ROLES["ours"], label="told")
-    acts.barh(places - 0.2, without, 0.38, color="0.75", label="not told")
+    acts.barh(places + 0.2, told, 0.38, color=ROLES["ours"], label="told")
+    acts.barh(places - 0.2, untold, 0.38, color="0.75", label="not told")
     acts.set_yticks(places, ARROWS, fontsize=10)
     acts.set(xlim=(0, 1.02))
     acts.invert_yaxis()
     acts.legend(fontsize=10, loc="upper center", bbox_to_anchor=(0.4, -0.12), ncols=2)
-    decides = _message_decides(inputs, actor, row)
     words, colour = ("the message decides", "#B22222") if decides else ("the message changes nothing", "0.3")
     acts.set_title(words, color=colour)
     canvas = FigureCanvasAgg(figure)

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from lt_lib.envs.layout import load_layout
+from lt_lib.pixels.episodes import arrival, roll_bank, slab_reached
 from lt_lib.pixels.executor import train_executor
-from lt_lib.pixels.trials import try_executor
 from lt_lib.settings.pixels import ExecutorConfig, PixelsConfig
 from lt_lib.store.run import Result, Run
 from lt_lib.store.runs import RunStore
@@ -52,11 +53,12 @@ def _tried(
     kept = {(key, look): after(trained[key], look) for key in sizes for look in training[key].looks}
     few = {key: each.bank.model_copy(update={"entries": TRIED}) for key, each in sizes.items()}
     drives = [
-        Run(try_executor, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
+        Run(roll_bank, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
         for (key, _), weights in kept.items()
     ]
     tried: dict[Any, list[tuple[float, Result]]] = {key: [] for key in sizes}
     for ((key, look), weights), driven in zip(kept.items(), store.fetch(drives, "trials"), strict=True):
         whole = weights | only(trained[key], "curve") | {"taken": np.array(look)}
-        tried[key].append((min(driven["arrives"].mean(), driven["touches"].mean()), whole))
+        blocks = load_layout(few[key].layout).blocks
+        tried[key].append((min(arrival(driven, blocks), slab_reached(driven, blocks)), whole))
     return {key: max(each, key=lambda one: one[0]) for key, each in tried.items()}

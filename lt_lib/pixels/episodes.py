@@ -173,3 +173,9 @@ def obedience(bank: Mapping[str, Any]) -> float:
 def arrival(bank: Mapping[str, Any], blocks: Bool[np.ndarray, "slab route"]) -> float:
     """Share of a bank's episodes on free routes that reached the goal: what a head's reward can be, at best."""
     return float(bank["success"][:, ~blocks].mean())
+
+
+def slab_reached(bank: Mapping[str, Any], blocks: Bool[np.ndarray, "slab route"]) -> float:
+    """Share of a bank's episodes on blocked routes that enter the commanded corridor and touch a slab."""
+    reached = (bank["entered"] == np.arange(blocks.shape[1])) & (bank["contacts"] > 0)
+    return float(reached[:, blocks].mean())

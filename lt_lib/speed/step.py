@@ -59,8 +59,7 @@ def mujoco_step(arena: Arena, action: Float[np.ndarray, "n 3"]) -> Callable[[], 
     batch = Batch(model, arena.n, nthread=1)
     poses = batch.bind("qpos")
     poses[:], batch.bind("ctrl")[:] = arena.pose, arena.command(action)
-    slabs = arena.layout.slabs[arena.slab]  # (n, slabs, 4)
-    batch.bind("mocap_pos")[:, :-1, :2] = (slabs[..., ::2] + slabs[..., 1::2]) / 2
+    batch.bind("mocap_pos")[:, :-1, :2] = arena.layout.slab_centres[arena.slab]
     batch.bind("mocap_pos")[:, -1, :2] = arena.scout[:, :2]
 
     def step() -> Float[np.ndarray, "n 3"]:
