@@ -363,7 +363,7 @@ def test_keeping_names_a_used_run_that_is_gone(released):
         keep(outputs, runs, kept)
 
 
-def test_an_execution_that_finds_all_its_runs_keeps_the_sitting_that_computed_them(released):
+def test_an_execution_that_finds_runs_finished_keeps_the_sitting_that_computed_them(released):
     outputs, runs, _ = released
 
     def entry(seconds, stages, used):
@@ -376,6 +376,9 @@ def test_an_execution_that_finds_all_its_runs_keeps_the_sitting_that_computed_th
     assert entry(90.0, computed, used)["sitting"] == {"commit": None, "seconds": 90.0, "stages": computed}
     again = entry(3.0, {}, used)
     assert again["seconds"] == 3.0 and again["sitting"]["seconds"] == 90.0
+    part = entry(40.0, {"train_toy": {"runs": 1, "seconds": 39.0}}, used)
+    assert part["seconds"] == 40.0 and part["sitting"]["seconds"] == 90.0
+    assert entry(60.0, computed, used)["sitting"]["seconds"] == 60.0, "computed from nothing again"
     assert entry(2.0, {}, used[:1])["sitting"]["seconds"] == 2.0, "other runs, from who knows where"
     assert entry(8.0, {}, [])["sitting"]["seconds"] == 8.0
     assert entry(7.0, {}, [])["sitting"]["seconds"] == 7.0, "what uses no run is a sitting of its own"

@@ -1,7 +1,7 @@
 """What an outputs folder was made with: library versions, commit, machine, seconds per notebook and stage.
 
-An execution that finds all its runs finished takes seconds. So that a figure can be drawn anew without the hours of a
-sitting from nothing, its entry keeps the seconds, stages and commit of the earlier one that computed these same runs.
+An execution that finds its runs finished takes seconds. So that a figure can be drawn anew without the hours of a
+sitting from nothing, its entry keeps the seconds, stages and commit of the one that computed more of these same runs.
 """
 
 import json
@@ -35,9 +35,10 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
     for name, entry in notebooks.items():
         entry = dict(entry) | commit
         runs = entry.pop("runs", [])
-        same = runs and runs == used.get(name) and not entry["stages"]
         own = {key: entry.get(key) for key in ("commit", "seconds", "stages")}
-        executed[name] = entry | {"sitting": earlier.get(name, {}).get("sitting", own) if same else own}
+        before = earlier.get(name, {}).get("sitting", own)
+        again = runs and runs == used.get(name) and (not entry["stages"] or computed(own) < computed(before))
+        executed[name] = entry | {"sitting": before if again else own}
         used[name] = runs
     manifest = {
         "profile": profile,
@@ -47,6 +48,11 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
     }
     write_atomically(path, (json.dumps(manifest, indent=2) + "\n").encode())
     write_atomically(path.with_name(USED), (json.dumps(dict(sorted(used.items())), indent=0) + "\n").encode())
+
+
+def computed(sitting: Mapping[str, Any]) -> int:
+    """How many runs a sitting computed."""
+    return sum(stage["runs"] for stage in sitting["stages"].values())
 
 
 def used_runs(outputs: Path) -> dict[str, list[str]]:
