@@ -9,7 +9,7 @@ from lt_lib.gridworld.protocol import GridProtocol
 from lt_lib.hardware.protocol import HardwareProtocol
 from lt_lib.hardware.registration import read_gates
 from lt_lib.perception.gates import GateError
-from lt_lib.pixels.crew import TRIED
+from lt_lib.pixels.crew import TRIAL
 from lt_lib.pixels.protocol import PixelProtocol
 from lt_lib.pixels.redraw import SCENES
 from lt_lib.settings.base import ROOT, Scene, Settings, UserError
@@ -92,7 +92,7 @@ def test_every_pixel_setting_of_a_profile_reaches_its_runs(profile):
     for section, function in STAGES.items():
         assert_arrives(pixels[section], store.configs(function), section)
     assert {name: getattr(protocol.sizes.gates, name) for name in pixels["gates"]} == pixels["gates"]
-    shards = [config for config in store.configs("roll_bank") if config.entries != TRIED]  # the others are trials
+    shards = [run for run in store.runs if run.function.__name__ == "roll_bank" and run.seed != TRIAL]
     assert len(shards) == pixels["shards"]
     assert set(pixels) == {*STAGES, "gates", "shards", "latency"}  # nothing else is left to check
     assert_shared_everywhere(store)

@@ -20,7 +20,7 @@ from lt_lib.store.runs import RunStore
 from lt_lib.store.states import after, only
 
 PARTS = 4  # that the second half of a training is divided into, the weights kept at each end
-TRIED, TRIAL = 4, 1_000  # draws that each of them drives, and the seed of those draws, no shard of a bank
+TRIED, TRIAL = 4, 1_000  # draws that each of them drives, as many as a shard at most; their seed, which no shard has
 SEEDS, ENOUGH = 3, 0.95  # trainings at most; shares of arrivals, and of slabs reached, that end the search
 
 
@@ -51,7 +51,7 @@ def _tried(
     runs = [Run(train_executor, training[key], seed, {"encoder": encoders[key]}) for key in sizes]
     trained = dict(zip(sizes, store.fetch(runs, "executors"), strict=True))
     kept = {(key, look): after(trained[key], look) for key in sizes for look in training[key].looks}
-    few = {key: each.bank.model_copy(update={"entries": TRIED}) for key, each in sizes.items()}
+    few = {key: each.bank.model_copy(update={"entries": min(TRIED, each.bank.entries)}) for key, each in sizes.items()}
     drives = [
         Run(roll_bank, few[key], TRIAL, {"encoder": encoders[key], "executor": weights})
         for (key, _), weights in kept.items()

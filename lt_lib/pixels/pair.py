@@ -21,7 +21,7 @@ from lt_lib.pixels.route import read_head, sent_wires
 from lt_lib.report import scene
 from lt_lib.store.run import Result
 
-PACE = 4  # control steps from one picture to the next
+PACE, MOST = 4, 50  # control steps from one picture to the next at least; pictures at most
 FIRST, EACH, LAST = 2_000, 90, 4_000  # milliseconds that pictures stay
 SIZE, DPI = (9.6, 2.9), 90  # inches
 COLOURS = 48
@@ -55,7 +55,8 @@ def film_pair(
 def save_pair(layout: Layout, takes: Mapping[str, Take], commit_step: int, path: Path) -> Path:
     """Writes the film: the moment of the choice is held, then both drive, and the last picture says how each ends."""
     ends = [len(take.poses) - 1 for take in takes.values()]
-    steps = [commit_step, *range(PACE, min(ends), PACE), max(ends)]
+    pace = max(PACE, -(-min(ends) // MOST))
+    steps = [commit_step, *range(pace, min(ends), pace), max(ends)]
     frames = [_picture(layout, takes, step, commit_step) for step in steps]
     return save_gif(path, frames, [FIRST, *[EACH] * (len(steps) - 2), LAST], COLOURS)
 
