@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lt_lib.report.entries import parsed, read_entries
-from lt_lib.report.firmness import firmness
+from lt_lib.report.firmness import FEW, RESAMPLES, firmness
 from lt_lib.report.inferred import INFERRED, calibrating_rows
 from lt_lib.settings.base import ROOT, Settings, UserError, require_known
 from lt_lib.store.files import write_checked
@@ -282,7 +282,8 @@ class Findings:
             return verdict(claim, Finding(**entry | {"real_frames": True}), JUDGED)
 
         rng = np.random.default_rng(crc32(name.encode()))
-        firm = firmness(judged, samples, rng, paired=paired, fixed=fixed)
+        resamples = RESAMPLES if self.profile == JUDGED else FEW
+        firm = firmness(judged, samples, rng, resamples, paired=paired, fixed=fixed)
         self.add(name, **found, judge=getattr(judge, "func", judge).__name__, firm=firm)
         return found
 

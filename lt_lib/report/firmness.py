@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-RESAMPLES = 200
+RESAMPLES, FEW = 200, 5  # where a verdict is given, and where none is and a judge must only bear it
 FRAGILE = 0.8  # share of resamples below which a verdict is marked fragile
 
 
@@ -13,6 +13,7 @@ def firmness(
     judge: Callable[..., Any],
     samples: Sequence[np.ndarray],
     rng: np.random.Generator,
+    resamples: int = RESAMPLES,
     *,
     paired: bool = False,
     fixed: bool = False,
@@ -26,13 +27,13 @@ def firmness(
     fixed   the first axis is a fixed design, such as the rows of a table, and is not resampled
     """
     verdict, kept = judge(*samples), 0
-    for _ in range(RESAMPLES):
+    for _ in range(resamples):
         if paired:
             places = _places(samples[0], rng, fixed)
             kept += judge(*(sample[places] for sample in samples)) == verdict
         else:
             kept += judge(*(sample[_places(sample, rng, fixed)] for sample in samples)) == verdict
-    return kept / RESAMPLES
+    return kept / resamples
 
 
 def _places(sample: np.ndarray, rng: np.random.Generator, fixed: bool) -> tuple[np.ndarray, ...]:
