@@ -105,19 +105,19 @@ class FrozenEncoder(Frozen):
 
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu", precision: str = "float32"):
         super().__init__(Encoder(), weights, device, precision)
-        first, self._encoder = self._encoder.layers[0], self._encoder.layers[1:]
+        first, self._encoder = self._encoder.layers[0], self._encoder.layers[2:]
         self._size, self._stride = first.kernel_size[0], first.stride[0]
         self._table = run_table(weights["E.layers.0.weight"], weights["E.layers.0.bias"])
 
     def inputs(self, observations: UInt8[np.ndarray, "b h w"]) -> Float[Tensor, "b c j j"]:
-        """The first convolution's outputs, channels last in memory."""
+        """The first convolution's outputs, rectified before they may lose precision; channels last in memory."""
         places = (observations.shape[1] - self._size) // self._stride + 1
         windows = len(observations) * places**2
         rows, starts = np.empty(windows * (self._size**2 + 1), np.int32), np.empty(windows + 1, np.int32)
         n = bags(observations, self._size, self._stride, len(PALETTE), rows, starts)
         picked = torch.from_numpy(rows[:n]), self._table, torch.from_numpy(starts)
         out = F.embedding_bag(*picked, mode="sum", include_last_offset=True)  # (windows, c)
-        return out.view(-1, places, places, out.shape[1]).permute(0, 3, 1, 2).to(self.device, self.dtype)
+        return out.relu_().view(-1, places, places, out.shape[1]).permute(0, 3, 1, 2).to(self.device, self.dtype)
 
 
 def run_table(weight: Float[np.ndarray, "c 3 k k"], bias: Float[np.ndarray, " c"]) -> Float[Tensor, "rows c"]:

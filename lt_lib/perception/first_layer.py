@@ -23,22 +23,21 @@ def bags(frames, size, stride, colours, rows, starts):
     starts        (windows + 1,) where each window's rows start
     """
     pixels, places, column = frames.shape[1], (frames.shape[1] - size) // stride + 1, size * size * colours
-    runs, count = np.empty((pixels, size), np.int32), np.empty(pixels, np.int32)  # of each column of a row of windows
+    bent = np.empty(pixels, frames.dtype)  # not 0 where a column of a row of windows has more than one colour
     alike = np.empty(pixels, np.int32)  # how many neighbouring columns up to here are all of one and the same colour
     n = 0
     for b in range(frames.shape[0]):
         for i in range(places):
             strip = frames[b, i * stride : i * stride + size]  # (size, P)
+            bent[:] = 0
+            for y in range(1, size):
+                above, here = strip[y - 1], strip[y]
+                for x in range(pixels):  # without a branch, so that many columns are compared at once
+                    bent[x] |= above[x] ^ here[x]
+            same = 0
             for x in range(pixels):
-                begin, count[x] = 0, 0
-                for y in range(1, size + 1):
-                    if y == size or strip[y, x] != strip[begin, x]:
-                        runs[x, count[x]] = (begin * size + y - 1) * colours + strip[begin, x]
-                        count[x] += 1
-                        begin = y
-                alike[x] = count[x] == 1
-                if x > 0 and count[x] == 1 and runs[x, 0] == runs[x - 1, 0]:
-                    alike[x] += alike[x - 1]
+                same = 0 if bent[x] else same + 1 if same > 0 and strip[0, x] == strip[0, x - 1] else 1
+                alike[x] = same
             for j in range(places):
                 starts[(b * places + i) * places + j] = n
                 left = j * stride
@@ -49,8 +48,13 @@ def bags(frames, size, stride, colours, rows, starts):
                 rows[n] = size * column + colours
                 n += 1
                 for x in range(size):
-                    for k in range(count[left + x]):
-                        rows[n] = x * column + runs[left + x, k]
-                        n += 1
+                    begin, seen = 0, strip[:, left + x]
+                    for y in range(1, size if bent[left + x] else 1):
+                        if seen[y] != seen[begin]:
+                            rows[n] = x * column + (begin * size + y - 1) * colours + seen[begin]
+                            n += 1
+                            begin = y
+                    rows[n] = x * column + (begin * size + size - 1) * colours + seen[begin]
+                    n += 1
     starts[frames.shape[0] * places * places] = n
     return n
