@@ -12,6 +12,7 @@ LOOK_S = 2  # between looks at whether a kernel that says nothing is still alive
 
 # Kernels start in notebooks/, where the environment may know another checkout's library.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # tests run side by side, threads would only wait
 os.environ.pop("MPLBACKEND", None)  # figures need none, so that an unknown one does not matter
 
 

@@ -31,7 +31,7 @@ from lt_lib.settings.base import ROOT, UserError
 from lt_lib.settings.profiles import GIVEN, load_profile, notebook_defaults, notebook_names
 from lt_lib.store import journal
 from lt_lib.store.files import claimed, runs_folder, writable_folder
-from lt_lib.store.local import cores
+from lt_lib.store.local import ONE_THREAD, cores
 from lt_lib.store.manifest import computed_since, write_manifest
 from lt_lib.store.progress import Progress, read_progress
 
@@ -154,9 +154,9 @@ def ended_by_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def kernels_environment(plan: Plan) -> Iterator[None]:
-    """The notebooks' environment: this library, the folder of runs, who asks for them, no backend (none is needed)."""
+    """The notebooks' environment: this library, the folder of runs, who asks for them, one thread, no backend."""
     library = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    ours = {"LT_RUNS": str(plan.runs), "PYTHONPATH": library, journal.ASKED_BY: uuid.uuid4().hex}
+    ours = {"LT_RUNS": str(plan.runs), "PYTHONPATH": library, journal.ASKED_BY: uuid.uuid4().hex} | ONE_THREAD
     with mock.patch.dict(os.environ, ours):
         os.environ.pop("MPLBACKEND", None)
         yield
