@@ -21,7 +21,7 @@ from lt_lib.pixels.route import read_head, sent_wires
 from lt_lib.report import scene
 from lt_lib.store.run import Result
 
-PACE, MOST = 4, 50  # control steps from one picture to the next at least; pictures at most
+PACE, MOST = 4, 50  # control steps from one picture to the next at least; pictures of the drive at most
 FIRST, EACH, LAST = 2_000, 90, 4_000  # milliseconds that pictures stay
 SIZE, DPI = (9.6, 2.9), 90  # inches
 COLOURS = 48

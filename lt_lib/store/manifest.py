@@ -37,7 +37,7 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
         runs = entry.pop("runs", [])
         own = {key: entry.get(key) for key in ("commit", "seconds", "stages")}
         before = earlier.get(name, {}).get("sitting", own)
-        again = runs and runs == used.get(name) and (not entry["stages"] or computed(own) < computed(before))
+        again = runs and runs == used.get(name) and (not entry["stages"] or _computed(own) < _computed(before))
         executed[name] = entry | {"sitting": before if again else own}
         used[name] = runs
     manifest = {
@@ -50,7 +50,7 @@ def write_manifest(path: Path, root: Path, profile: str, notebooks: Mapping[str,
     write_atomically(path.with_name(USED), (json.dumps(dict(sorted(used.items())), indent=0) + "\n").encode())
 
 
-def computed(sitting: Mapping[str, Any]) -> int:
+def _computed(sitting: Mapping[str, Any]) -> int:
     """How many runs a sitting computed."""
     return sum(stage["runs"] for stage in sitting["stages"].values())
 
