@@ -48,8 +48,9 @@ def _tried(
 ) -> dict[Any, tuple[float, Result]]:
     """Of one training each, how often its best weights get there, free or blocked, and the weights."""
     training = {key: with_looks(each.executor) for key, each in sizes.items()}
-    runs = [Run(train_executor, training[key], seed, {"encoder": encoders[key]}) for key in sizes]
-    trained = dict(zip(sizes, store.fetch(runs, "executors"), strict=True))
+    seeds = range(seed, min(seed + 1 + (len(sizes) == 1), SEEDS))  # beside a lone training the next, on an idle core
+    runs = [Run(train_executor, training[key], each, {"encoder": encoders[key]}) for each in seeds for key in sizes]
+    trained = dict(zip(sizes, store.fetch(runs, "executors")[: len(sizes)], strict=True))
     kept = {(key, look): after(trained[key], look) for key in sizes for look in training[key].looks}
     few = {key: each.bank.model_copy(update={"entries": min(TRIED, each.bank.entries)}) for key, each in sizes.items()}
     drives = [

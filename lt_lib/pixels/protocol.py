@@ -5,6 +5,7 @@ Everything but the message is held fixed: one frozen encoder, one frozen executo
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -164,8 +165,10 @@ class PixelProtocol:
             **rows,
             ("float32", SEED): once.model_copy(update={"precision": "float32", "episodes": 2 * once.batch}),
         }
-        runs = {key: Run(train_redrawn_head, config, key[1], inputs) for key, config in configs.items()}
-        return fetch_by_name(self.store.fetch, runs, "redrawn heads")
+        longest_first = sorted(configs, key=lambda key: configs[key].every or inf)
+        runs = {key: Run(train_redrawn_head, configs[key], key[1], inputs) for key in longest_first}
+        drawn = fetch_by_name(self.store.fetch, runs, "redrawn heads")
+        return {name: drawn[name] for name, _ in configs}
 
     def corrupted(
         self, name: str, seed: int, head: Result, episodes: int, bank: Result, encoder: Result
