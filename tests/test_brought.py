@@ -1,5 +1,7 @@
 """What people bring: edited constants, copied notebooks, odd paths and yaml, foreign repositories, planted files."""
 
+import base64
+import io
 import json
 import os
 import pickle
@@ -13,6 +15,7 @@ import nbformat
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image as Picture
 from toy_project import COMPUTE, WRITE, smoke, write_notebook
 from toy_runs import ToyConfig, train_toy
 
@@ -273,7 +276,11 @@ def outputs(tmp_path) -> Path:
     for name in ("notebooks", "figures"):
         (folder / name).mkdir(parents=True)
     cell = nbformat.v4.new_code_cell("profile = '<script>alert(1)</script>'")
+    picture = io.BytesIO()
+    Picture.new("RGB", (1, 1)).save(picture, "png")
+    pictures = {"image/png": base64.b64encode(picture.getvalue()).decode()}
     cell.outputs = [nbformat.v4.new_output("stream", text="frames of <script>alert(2)</script>")]
+    cell.outputs.append(nbformat.v4.new_output("display_data", data=pictures))
     nbformat.write(nbformat.v4.new_notebook(cells=[cell]), folder / "notebooks" / "02_encoder.ipynb")
     row = dict.fromkeys(COLUMNS, "") | {"id": "a", "notebook": "02_encoder", "note": "<script>alert(3)</script>"}
     pd.DataFrame([row]).to_csv(folder / "scoreboard.csv", index=False)
@@ -289,6 +296,12 @@ def test_no_name_or_parameter_becomes_a_script_of_the_report(outputs):
         text = page.read_text()
         assert "<script>alert" not in text and "<i>x" not in text
         assert "alert" in text or page.stem == "made"
+
+
+def test_the_site_leaves_nothing_beside_itself(outputs):
+    before = set(outputs.iterdir())
+    assert (write_report(outputs).parent / "notebooks" / "02_encoder.html").exists()
+    assert set(outputs.iterdir()) == before | {outputs / "report"}
 
 
 @pytest.mark.parametrize("file", ["manifest.json", "notebooks/02_encoder.ipynb"])

@@ -72,7 +72,8 @@ def write_report(outputs: Path) -> Path:
         }
         for name, text in pages.items():
             (source / f"{name}.md").write_text(text, encoding="utf-8")
-        _build(source, folder, Path(place) / "doctrees")
+        _build(source, Path(place) / "site", Path(place) / "doctrees")  # MyST-NB leaves pictures beside what it builds
+        shutil.copytree(Path(place) / "site", folder, dirs_exist_ok=True)
     return folder / "index.html"
 
 
