@@ -20,7 +20,7 @@ from lt_lib.store.files import kept_folder
 from lt_lib.store.kept import keep
 from lt_lib.store.manifest import computed_since, write_manifest
 from lt_lib.store.progress import Reporter, read_progress, stage, write_fraction
-from lt_lib.store.run import Run, pack, unpack
+from lt_lib.store.run import Run, bare, pack, unpack
 from lt_lib.store.runs import RunError, RunStore
 from lt_lib.store.sources import source_digest
 
@@ -93,6 +93,17 @@ def test_key_follows_function_config_seed_and_the_contents_of_inputs():
     ]
     assert len({run.key() for run in runs}) == len(runs)
     assert Run(train_toy, ToyConfig(size=4), 0, {"start": {"weights": np.zeros((4, 3))}}).key() == runs[4].key()
+
+
+def test_a_run_that_starts_from_weights_left_out_has_the_key_of_one_that_starts_from_the_weights():
+    start = {"weights": np.arange(12.0).reshape(4, 3), "one": np.array(2.5), "none": np.empty((0, 4)), "text": "so"}
+    keys = {Run(train_toy, ToyConfig(), 0, {"start": each}).key() for each in (start, bare(start), bare(bare(start)))}
+    others = (start["weights"].reshape(3, 4), start["weights"].astype(np.float32), start["weights"] + 1)
+    changed = {Run(train_toy, ToyConfig(), 0, {"start": start | {"weights": other}}).key() for other in others}
+    assert len(keys) == 1 and len(keys | changed) == 4
+    assert unpack(pack(bare(start))) == bare(start)
+    with pytest.raises(UserError, match="the release leaves these weights out"):
+        np.asarray(bare(start)["weights"])
 
 
 def test_key_follows_what_settings_compute_and_its_name_in_errors_does_not(tmp_path):

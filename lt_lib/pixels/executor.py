@@ -52,7 +52,9 @@ class FrozenExecutor:
     def __init__(self, weights: Mapping[str, np.ndarray], device: str = "cpu"):
         self.routes = weights["mean.0.weight"].shape[1] - LATENT
         self._policy = Executor(self.routes).to(device).requires_grad_(False)
-        self._policy.load_state_dict({name: torch.tensor(weights[name]) for name in self._policy.state_dict()})
+        self._policy.load_state_dict(
+            {name: torch.tensor(np.asarray(weights[name])) for name in self._policy.state_dict()}
+        )
 
     @torch.inference_mode()
     def mean_action(self, latent: Float[Tensor, "b 64"], route) -> Float[np.ndarray, "b 3"]:

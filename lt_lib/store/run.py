@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from lt_lib.settings.base import Settings
+from lt_lib.settings.base import Settings, UserError
 from lt_lib.store.computer import computer
 from lt_lib.store.progress import Reporter
 from lt_lib.store.sources import source_digest
@@ -32,6 +32,23 @@ Submit = Callable[[str, "Run"], "Future[Packed]"]  # has a worker compute a run,
 
 # What a result may depend on besides our own code.
 LIBRARIES = ("torch", "numpy", "scipy", "numba", "mujoco", "scikit-learn", "opencv-python-headless")
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """The place of an array that a release leaves out: its digest, which still names the runs that start from it."""
+
+    digest: str
+
+    @classmethod
+    def of(cls, array: np.ndarray) -> "LeftOut":
+        """An array's place; the digest is the sha256 of its type, shape and contents."""
+        return cls(hashlib.sha256(f"{array.dtype.str} {array.shape} ".encode() + array.tobytes()).hexdigest())
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        raise UserError(
+            "the release leaves these weights out; `python run_all.py --only` with this notebook makes them"
+        )
 
 
 @dataclass(frozen=True)
@@ -55,7 +72,7 @@ class Run:
             "function": f"{self.function.__module__}.{self.function.__qualname__}",
             "config": self.config.model_dump(mode="json"),
             "seed": self.seed,
-            "inputs": {name: hashlib.sha256(pack(result)).hexdigest() for name, result in self.inputs.items()},
+            "inputs": {name: hashlib.sha256(pack(bare(result))).hexdigest() for name, result in self.inputs.items()},
             "source": source_digest(self.function, type(self.config), folder=folder),
             "libraries": library_versions(),
         }
@@ -74,35 +91,55 @@ def compute(run: Run, tell: Callable[[float], None]) -> Packed:
     return payload, time.perf_counter() - started, computer()
 
 
+def bare(result: Result) -> Result:
+    """The result with all of its arrays left out, which tells its contents as well."""
+    return {name: LeftOut.of(_numeric(name, value)) if _is_array(value) else value for name, value in result.items()}
+
+
 def pack(result: Result) -> bytes:
     """A result as safetensors bytes, equal for equal results; everything but arrays goes into the header as JSON.
 
     Raises TypeError naming an entry that is neither a numeric array nor JSON.
     """
-    arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
+    arrays = {name: _numeric(name, value) for name, value in result.items() if _is_array(value)}
     values = {name: value for name, value in result.items() if name not in arrays}
-    for name, value in arrays.items():
-        if value.dtype.kind not in "biuf":
-            raise TypeError(f"result {name!r}: cannot store an array of {value.dtype}; use numbers or a list")
-        arrays[name] = np.asarray(value, order="C")
     try:
-        header = json.dumps(values, sort_keys=True, default=_plain_number)
+        header = json.dumps(values, sort_keys=True, default=_plain)
     except TypeError as error:
         raise TypeError(f"one of the results {sorted(values)}: {error}") from None
     return safetensors.numpy.save(arrays, {"values": header})
 
 
-def _plain_number(value: Any) -> Any:
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray)
+
+
+def _numeric(name: str, array: np.ndarray) -> np.ndarray:
+    """The array, contiguous; raises TypeError if it holds anything but numbers."""
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"result {name!r}: cannot store an array of {array.dtype}; use numbers or a list")
+    return np.asarray(array, order="C")
+
+
+def _plain(value: Any) -> Any:
+    """What JSON writes for a value of ours."""
+    if isinstance(value, LeftOut):
+        return {"left out": value.digest}
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"cannot store a {type(value).__name__}; use an array, a number, text or a list")
+
+
+def _ours(entry: dict[str, Any]) -> Any:
+    """Undoes `_plain`."""
+    return LeftOut(entry["left out"]) if entry.keys() == {"left out"} else entry
 
 
 def unpack(payload: bytes) -> Result:
     """The result in packed bytes."""
     length = int.from_bytes(payload[:8], "little")
     header = json.loads(payload[8 : 8 + length])
-    return safetensors.numpy.load(payload) | json.loads(header["__metadata__"]["values"])
+    return safetensors.numpy.load(payload) | json.loads(header["__metadata__"]["values"], object_hook=_ours)
 
 
 @cache

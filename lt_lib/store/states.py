@@ -16,9 +16,12 @@ def state_of(module: nn.Module, prefix: str) -> dict[str, np.ndarray]:
 
 
 def restored(module: Module, result: Mapping[str, Any], prefix: str) -> Module:
-    """The module with its weights from a result; other entries are ignored."""
-    state = {name.removeprefix(f"{prefix}."): torch.tensor(value) for name, value in only(result, prefix).items()}
-    module.load_state_dict(state)
+    """The module with its weights from a result; other entries are ignored.
+
+    Raises UserError if the release leaves them out.
+    """
+    weights = {name.removeprefix(f"{prefix}."): np.asarray(value) for name, value in only(result, prefix).items()}
+    module.load_state_dict({name: torch.tensor(value) for name, value in weights.items()})
     return module
 
 
