@@ -123,7 +123,7 @@ class RunStore:
 
     def _keep(self, key: str, run: Run, payload: bytes, seconds: float, made_on: str) -> None:
         """Writes a run's file, then its line in the journal."""
-        write_atomically(self._path(key, run), _head(payload, made_on) + b"\n" + payload)
+        write_atomically(self._path(key, run), sealed(payload, made_on))
         line = {
             "key": key,
             "function": run.function.__name__,
@@ -145,17 +145,14 @@ def fetch_by_name(
     return results
 
 
+def sealed(payload: bytes, made_on: str) -> bytes:
+    """A run's file: a line with its checksum, which covers the computer that made it too; then the packed result."""
+    checksum = hashlib.sha256(payload + made_on.encode()).hexdigest()
+    return f"sha256 {checksum} {made_on}\n".encode() + payload
+
+
 def checked(content: bytes) -> tuple[Result, str] | None:
     """The result in a run's file and the computer that made it; None if the file is truncated or altered."""
     head, _, payload = content.partition(b"\n")
     made_on = head.decode(errors="replace").split(" ", 2)[-1]
-    return (unpack(payload), made_on) if head == _head(payload, made_on) else None
-
-
-def _head(payload: bytes, made_on: str) -> bytes:
-    """The first line of a run's file: its checksum, which covers the computer too."""
-    return _checksum(payload + made_on.encode()) + b" " + made_on.encode()
-
-
-def _checksum(payload: bytes) -> bytes:
-    return b"sha256 " + hashlib.sha256(payload).hexdigest().encode()
+    return (unpack(payload), made_on) if content == sealed(payload, made_on) else None
