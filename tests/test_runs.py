@@ -17,7 +17,7 @@ from toy_runs import ToyConfig, count_threads, lose_worker, train_toy
 
 from lt_lib.settings.base import UserError
 from lt_lib.store.files import kept_folder
-from lt_lib.store.kept import keep
+from lt_lib.store.kept import keep, lightened
 from lt_lib.store.manifest import computed_since, write_manifest
 from lt_lib.store.progress import Reporter, read_progress, stage, write_fraction
 from lt_lib.store.run import Run, bare, pack, unpack
@@ -360,6 +360,22 @@ def test_notebooks_opened_by_hand_read_the_runs_of_a_release_and_recompute_damag
     assert caplog.text.count("truncated or altered") == 2
 
 
+@pytest.mark.parametrize(
+    ("function", "seed", "left_out"),
+    [
+        ("roll_navigator", 1, []),
+        ("train_head", 0, []),
+        ("train_head", 1, ["head.0.weight"]),
+        ("train_navigator", 0, ["head.0.weight"]),
+    ],
+)
+def test_a_release_leaves_out_the_weights_that_only_runs_start_from(function, seed, left_out):
+    result = {"head.0.weight": np.ones(3), "head.0.bias": np.ones(3), "path": np.ones(3), "loss": 1.0}
+    light = lightened(result, function, seed)
+    assert [name for name, value in light.items() if value is not result[name]] == left_out
+    assert light.keys() == result.keys() and pack(bare(light)) == pack(bare(result))
+
+
 def test_run_all_does_not_see_what_a_release_keeps(tmp_path, monkeypatch):
     monkeypatch.delenv("LT_RUNS", raising=False)
     assert kept_folder(tmp_path) == tmp_path / "outputs" / "kept"
@@ -370,7 +386,7 @@ def test_run_all_does_not_see_what_a_release_keeps(tmp_path, monkeypatch):
 def test_keeping_names_a_used_run_that_is_gone(released):
     outputs, runs, kept = released
     (runs / "train_toy" / f"{toys(1)[0].key()}.run").unlink()
-    with pytest.raises(UserError, match="lacks 1 runs that .*outputs used .train_toy/"):
+    with pytest.raises(UserError, match="runs/train_toy/.* is missing or damaged; run_all.py makes it"):
         keep(outputs, runs, kept)
 
 
