@@ -64,18 +64,29 @@ def pictures(layout: Layout, take: Take, every: int, title: str, height: int = 2
     slab, frames = np.array([take.slab]), []
     for step in range(0, len(take.poses), every):
         pose = take.poses[step]
-        above = Image.fromarray(top.picture(pose, take.slab, take.scout))
-        above = np.asarray(above.resize((above.width * height // above.height, height)))
+        above = np.asarray(from_above(top, pose, take.slab, take.scout, height))
         seen = colours(eye.frames(pose[None], slab, take.scout[None, :2]))[0]
         sent = colours(eye.frames(take.scout[None], slab, pose[None, :2]))[0]
         gap = np.full((height, 6, 3), 255, np.uint8)
         slabs = " ".join(layout.sides[side] for side in layout.placements[take.slab])
         words = f"{title}: slab {slabs}, head chose {layout.sides[take.route]}; {step / CONTROL_HZ:.0f} s"
-        frames.append(_captioned(np.concatenate([above, gap, seen, gap, sent], axis=1), words, above.shape[1]))
+        frames.append(captioned(np.concatenate([above, gap, seen, gap, sent], axis=1), words, above.shape[1]))
     return frames
 
 
-def _captioned(picture, words: str, left: int) -> UInt8[np.ndarray, "h w 3"]:
+def from_above(top: TopView, navigator, slab: int, scout, height: int) -> Image.Image:
+    """The scene from straight above, `height` pixels high, with names on the robots; else as `TopView.picture`."""
+    picture = Image.fromarray(top.picture(navigator, slab, scout))
+    picture = picture.resize((picture.width * height // picture.height, height))
+    left, right, bottom, up = top.extent
+    for name, (x, y) in {"navigator": navigator[:2], "scout": scout[:2]}.items():
+        at = picture.width * (x - left) / (right - left), height * (up - y) / (up - bottom)
+        ImageDraw.Draw(picture).text((at[0], at[1] - 6), name, "white", anchor="mb", font=ImageFont.load_default(11))
+    return picture
+
+
+def captioned(picture: UInt8[np.ndarray, "h w 3"], words: str, left: int) -> UInt8[np.ndarray, "h2 w 3"]:
+    """A view from above, `left` pixels wide, with two square ones beside it, under a band that says what they are."""
     canvas = Image.new("RGB", (picture.shape[1], picture.shape[0] + BAND), "white")
     canvas.paste(Image.fromarray(picture), (0, BAND))
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(13)
@@ -92,12 +103,13 @@ def save_gif(
     path: Path,
     frames: Sequence[UInt8[np.ndarray, "h w 3"]],
     milliseconds: int | Sequence[int] = 80,
-    colours: int = 32,
 ) -> Path:
-    """Writes a looping GIF of few colours; milliseconds are of every frame, or of each."""
+    """Writes a looping GIF of 128 colours, the same in every frame; milliseconds are of every frame, or of each."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    small = [np.asarray(Image.fromarray(f).quantize(colours, dither=Image.Dither.NONE).convert("RGB")) for f in frames]
-    iio.imwrite(path, small, duration=milliseconds, loop=0)
+    # Octrees split by colour, not by area: small things, such as the robots, keep theirs beside a textured picture.
+    few = Image.fromarray(np.concatenate(frames)).quantize(128, method=Image.Quantize.FASTOCTREE)
+    small = [Image.fromarray(frame).quantize(palette=few, dither=Image.Dither.NONE).convert("RGB") for frame in frames]
+    iio.imwrite(path, [np.asarray(frame) for frame in small], duration=milliseconds, loop=0)
     return path
 
 

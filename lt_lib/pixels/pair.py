@@ -24,7 +24,6 @@ from lt_lib.store.run import Result
 PACE, MOST = 4, 50  # control steps from one picture to the next at least; pictures of the drive at most
 FIRST, EACH, LAST = 2_000, 90, 4_000  # milliseconds that pictures stay
 SIZE, DPI = (9.6, 2.9), 90  # inches
-COLOURS = 48
 
 
 def film_pair(
@@ -58,7 +57,7 @@ def save_pair(layout: Layout, takes: Mapping[str, Take], commit_step: int, path:
     pace = max(PACE, -(-min(ends) // MOST))
     steps = [commit_step, *range(pace, min(ends), pace), max(ends)]
     frames = [_picture(layout, takes, step, commit_step) for step in steps]
-    return save_gif(path, frames, [FIRST, *[EACH] * (len(steps) - 2), LAST], COLOURS)
+    return save_gif(path, frames, [FIRST, *[EACH] * (len(steps) - 2), LAST])
 
 
 def _picture(layout: Layout, takes: Mapping[str, Take], step: int, commit_step: int) -> UInt8[np.ndarray, "h w 3"]:
