@@ -19,7 +19,7 @@ from lt_lib.store.manifest import used_runs
 from lt_lib.store.run import Result, bare, pack
 from lt_lib.store.runs import COMPRESSED, checked, sealed
 
-WORTH = 10.0  # seconds of computing per compressed megabyte
+WORTH = 5.0  # seconds of computing per compressed megabyte
 STARTED_FROM = ("train_navigator", "train_grid_end_to_end", "train_grid_reader", "train_radio")
 FIRST_SHOWN = ("train_encoder", "train_end_to_end", "train_grid", "train_head")  # notebooks show the weights of seed 0
 
