@@ -125,9 +125,8 @@ def test_the_committed_full_run_is_of_the_present_source_in_one_sitting_from_not
     assert {name for name, sitting in sittings.items() if sitting["stages"]} >= TRAIN_OR_EVALUATE  # nothing was kept
     for beyond, longest in LONGEST_S.items():
         own = [sitting for name, sitting in sittings.items() if (name >= BEYOND) == beyond]
-        assert (
-            len({sitting["commit"] for sitting in own if sitting["stages"]}) == 1
-        )  # what computes nothing has no sitting
+        commits = {sitting["commit"] for sitting in own if sitting["stages"]}  # what computes nothing has no sitting
+        assert len(commits) == 1
         assert sum(sitting["seconds"] for sitting in own) <= longest
     assert "not run" not in (FULL / "scoreboard.csv").read_text(encoding="utf-8")
     changed = source_changed_since(next(iter(notebooks.values()))["commit"])
