@@ -386,7 +386,16 @@ def test_run_all_does_not_see_what_a_release_keeps(tmp_path, monkeypatch):
 def test_keeping_names_a_used_run_that_is_gone(released):
     outputs, runs, kept = released
     (runs / "train_toy" / f"{toys(1)[0].key()}.run").unlink()
-    with pytest.raises(UserError, match="runs/train_toy/.* is missing or damaged; run_all.py makes it"):
+    with pytest.raises(UserError, match="lacks 1 runs that .*outputs used .train_toy/"):
+        keep(outputs, runs, kept)
+    assert not kept.exists()
+
+
+def test_keeping_names_a_used_run_that_is_damaged(released):
+    outputs, runs, kept = released
+    path = runs / "train_toy" / f"{toys(1)[0].key()}.run"
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(UserError, match=f"{path} is truncated or altered; run_all.py makes it again"):
         keep(outputs, runs, kept)
 
 

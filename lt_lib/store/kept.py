@@ -27,9 +27,11 @@ FIRST_SHOWN = ("train_encoder", "train_end_to_end", "train_grid", "train_head") 
 def keep(outputs: Path, runs: Path, kept: Path) -> int:
     """Keeps the runs that an outputs folder used; returns the bytes that they take.
 
-    Raises UserError for a used run that the folder of finished runs lacks, or has damaged.
+    Raises UserError for a used run that the folder of finished runs lacks, before anything is written, or has damaged.
     """
     names = {name for used in used_runs(outputs).values() for name in used}
+    if missing := sorted(name for name in names if not (runs / name).exists()):
+        raise UserError(f"{runs} lacks {len(missing)} runs that {outputs} used ({missing[0]}); run_all.py makes them")
     computed, sizes = computed_runs(runs), {}
     for name in sorted(names):
         seed, seconds = computed.get(Path(name).stem, (0, 0.0))
@@ -43,10 +45,10 @@ def keep(outputs: Path, runs: Path, kept: Path) -> int:
 
 
 def compressed(path: Path, seed: int) -> bytes:
-    """A finished run's file as a release keeps it. Raises UserError where it is missing or damaged."""
-    run = checked(path.read_bytes()) if path.exists() else None
+    """A finished run's file as a release keeps it. Raises UserError where it is damaged."""
+    run = checked(path.read_bytes())
     if not run:
-        raise UserError(f"{path} is missing or damaged; run_all.py makes it")
+        raise UserError(f"{path} is truncated or altered; run_all.py makes it again")
     result, made_on = run
     return lzma.compress(sealed(pack(lightened(result, path.parent.name, seed)), made_on))
 
